@@ -1,0 +1,155 @@
+"""Maximum a posteriori: the most probable model given a recording and a prior. Dissertation (2.20)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as ox
+from jaxtyping import Array, Float
+
+from ._errors import InputError
+from ._model import StateSpaceModel
+from ._objectives import MARGINAL_LIKELIHOOD, AbstractObjective, TimeSeries, as_time_series
+from ._parameters import flatten, named_parameters, value_of
+from ._prior import AbstractDensity, Prior
+
+# Stands for an infinite score inside the optimiser, which can compare it but must not subtract infinities.
+_HOPELESS = 1e12
+# Up to this many parameters forward derivatives are the faster ones (performance.md).
+_FORWARD = 12
+_RESTARTS = 4
+
+
+class Estimate(eqx.Module):
+    """The most probable model, with what was asked of it.
+
+    `log_posterior` is the log likelihood plus the log prior density of the free coordinates, in nats (not
+    normalised); `log_likelihood` is the first of them. `gradient_norm` is the largest slope of the log
+    posterior along a free coordinate at the end, in nats. `promised` is how many nats a quadratic model
+    still expects; `converged` says that it is below the tolerance. Where it is False, the model is the best
+    one met.
+    """
+
+    model: StateSpaceModel
+    recording: TimeSeries
+    objective: AbstractObjective
+    prior: Prior
+    log_posterior: float
+    log_likelihood: float
+    gradient_norm: float
+    promised: float
+    converged: bool
+    steps: int
+
+    def values(self) -> dict[str, Array]:
+        """The values learnt, by name."""
+        return {name: value_of(leaf) for name, leaf in named_parameters(self.model).items()}
+
+    def __str__(self) -> str:
+        lines = [f"{name} = {value}" for name, value in self.values().items()]
+        end = "converged" if self.converged else "NOT CONVERGED: do not use as a MAP"
+        score = f"log posterior {self.log_posterior:.3f} nats, {end}, {self.steps} steps"
+        return "\n".join(["Estimate (MAP)", *lines, score])
+
+
+def fit(
+    model: StateSpaceModel,
+    recording: Any,
+    objective: AbstractObjective = MARGINAL_LIKELIHOOD,
+    *,
+    prior: Prior | AbstractDensity,
+    tolerance: float = 1e-5,
+    max_steps: int = 500,
+) -> Estimate:
+    """The maximum a posteriori model, by BFGS in free coordinates from the model as given.
+
+    **Arguments:** `recording` - times and readings; `prior` - a `Prior`, or one density such as `Flat()` for
+    every leaf; `tolerance` - nats that a quadratic model may still promise at the end; `max_steps` - of one
+    BFGS run; it is started afresh up to four times.
+
+    **Raises:** `InputError` where nothing learns, a leaf has no prior, or the start has no finite score.
+    """
+    prior = prior if isinstance(prior, Prior) else Prior(prior)
+    series = as_time_series(recording)
+    if not named_parameters(model):
+        raise InputError(
+            "Nothing in the model learns: every number is known or `Frozen`. Wrap one in `Positive`."
+        )
+    posterior, likelihood, slope = _at(model, series, objective, prior)
+    if not bool(jnp.isfinite(posterior)):
+        raise InputError(
+            f"The model has no finite score at its start: log likelihood {float(likelihood):.3g} and log "
+            f"posterior {float(posterior):.3g} nats; start from smaller coefficients or larger noises."
+        )
+    steps, promised = 0, jnp.inf
+    for _ in range(_RESTARTS):
+        # The first step of BFGS is the gradient: scaled so that it has length 1 and no trajectory escapes.
+        scale = 1.0 / jnp.maximum(jnp.linalg.norm(slope), 1e-12)
+        model, inverse, taken = _descend(model, series, objective, prior, scale, max_steps)
+        posterior, likelihood, slope = _at(model, series, objective, prior)
+        promised = 0.5 * slope @ inverse @ slope
+        steps += int(taken)
+        if float(promised) <= tolerance:
+            break
+    return Estimate(
+        model,
+        series,
+        objective,
+        prior,
+        log_posterior=float(posterior),
+        log_likelihood=float(likelihood),
+        gradient_norm=float(jnp.max(jnp.abs(slope))),
+        promised=float(promised),
+        converged=float(promised) <= tolerance,
+        steps=steps,
+    )
+
+
+def negative_log_posterior(
+    model: StateSpaceModel, series: TimeSeries, objective: AbstractObjective, prior: Prior
+) -> Float[Array, ""]:
+    """The score of the model plus minus the log prior density of its free coordinates, in nats."""
+    return objective(model, series) - prior.log_density(model)
+
+
+@eqx.filter_jit
+def _at(model, series, objective, prior):
+    """Log posterior, log likelihood, and the gradient of minus the log posterior in free coordinates."""
+    free, rebuild = flatten(model)
+    score = guarded(lambda free: negative_log_posterior(rebuild(free), series, objective, prior), free.size)
+    likelihood = -objective(model, series)
+    return likelihood + prior.log_density(model), likelihood, jax.grad(score)(free)
+
+
+@eqx.filter_jit
+def _descend(model, series, objective, prior, scale, max_steps):
+    """One run of BFGS: the best model met, BFGS's own inverse Hessian of the score, the steps."""
+    start, rebuild = flatten(model)
+    score = guarded(lambda free: negative_log_posterior(rebuild(free), series, objective, prior), start.size)
+    solver: Any = ox.BestSoFarMinimiser(ox.BFGS(rtol=1e-10, atol=1e-10))
+    solution: Any = ox.minimise(
+        lambda free, _: scale * score(free), solver, start, max_steps=max_steps, throw=False
+    )
+    inverse = scale * solution.state.state.f_info.hessian_inv.as_matrix()
+    return rebuild(solution.value), inverse, solution.stats["num_steps"]
+
+
+def guarded(score: Callable[[Array], Array], size: int) -> Callable[[Array], Array]:
+    """`score` with a large finite number for every non-finite one, and with derivatives that are never
+    NaN."""
+    derivative = jax.jacfwd if size <= _FORWARD else jax.grad
+
+    @jax.custom_jvp
+    def safe(free):
+        value = score(free)
+        return jnp.where(jnp.isfinite(value), value, _HOPELESS)
+
+    @safe.defjvp
+    def _(primals, tangents):
+        gradient = derivative(score)(primals[0])
+        gradient = jnp.where(jnp.isfinite(gradient), gradient, 0.0)
+        return safe(primals[0]), gradient @ tangents[0]
+
+    return safe

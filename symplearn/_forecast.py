@@ -1,0 +1,99 @@
+"""What comes after a recording: one deterministic path, and a Gaussian by the filter's own moments."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ._errors import InputError
+from ._filter import UnscentedTransform
+from ._fit import Estimate
+from ._model import StateSpaceModel, intervals_between
+from ._objectives import MarginalLikelihood
+from ._parameters import resolve
+
+
+class Forecast(eqx.Module):
+    """Readings and states ahead of a recording, at `times`.
+
+    `path` (time, channel) is the deterministic push-forward of the last filtered mean, process noise off.
+    `means` and `sds` are those of the readings to come, process and measurement noise included; `state_*`
+    those of the state. Parameters are at their MAP: their uncertainty is not in the `sds`.
+    """
+
+    times: Float[Array, " time"]
+    path: Float[Array, "time channel"]
+    means: Float[Array, "time channel"]
+    sds: Float[Array, "time channel"]
+    state_path: Float[Array, "time state"]
+    state_means: Float[Array, "time state"]
+    state_covariances: Float[Array, "time state state"]
+
+    def __str__(self) -> str:
+        first, last = float(self.times[0]), float(self.times[-1])
+        ends = f"sd {np.asarray(self.sds[0])} at {first:g}, {np.asarray(self.sds[-1])} at {last:g}"
+        return f"Forecast of {self.times.shape[0]} readings from {first:g} to {last:g}: {ends}"
+
+
+def forecast(estimate: Estimate, *, until: float | None = None, times: Any = None) -> Forecast:
+    """Forecast an estimate beyond its recording.
+
+    **Arguments:** give one of `until` - the last time, in steps of the recording's last interval; `times` -
+    increasing times after the recording's last. Process noise of `AdditiveGaussian` is added once per
+    forecast interval, so with it keep to the recording's spacing.
+
+    **Raises:** `InputError` where not exactly one is given, times do not lie ahead, or the forecast is not
+    finite.
+    """
+    objective = (
+        estimate.objective if isinstance(estimate.objective, MarginalLikelihood) else MarginalLikelihood()
+    )
+    recorded = np.asarray(estimate.recording.times)
+    ahead = _times_ahead(recorded, until, times)
+    filtered = objective.filter(estimate.model, estimate.recording)
+    grid = jnp.concatenate([estimate.recording.times[-1:], jnp.asarray(ahead)])
+    start = filtered.filtered_means[-1], filtered.filtered_covariances[-1]
+    result = _push_forward(resolve(estimate.model), objective.transform, grid, *start)
+    if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in (*jax.tree.leaves(result), *start)):
+        raise InputError(
+            f"The forecast is not finite before t = {ahead[-1]:g}: the model escapes. Forecast less far."
+        )
+    return result
+
+
+def _times_ahead(recorded: np.ndarray, until: float | None, times: Any) -> np.ndarray:
+    if (until is None) == (times is None):
+        raise InputError("`forecast` needs either `until` or `times`, and not both.")
+    last, spacing = recorded[-1], recorded[-1] - recorded[-2]
+    if times is None:
+        # The small share lets `until` itself be reached in spite of round-off.
+        count = math.floor((float(until or 0.0) - last) / spacing + 1e-6)
+        times = last + spacing * np.arange(1, count + 1)
+    ahead = np.asarray(times, dtype=float)
+    if ahead.ndim != 1 or len(ahead) == 0 or not np.all(np.diff(np.concatenate([[last], ahead])) > 0):
+        raise InputError(
+            f"A forecast needs increasing times after the recording's last, {last:g}; one interval is "
+            f"{spacing:g}."
+        )
+    return ahead
+
+
+@eqx.filter_jit
+def _push_forward(model: StateSpaceModel, transform: UnscentedTransform, grid: Array, m: Array, P: Array):
+    R = model.measurement_noise.covariance()
+
+    def step(carry, interval):
+        x, m, P = carry
+        moments = transform.moments(lambda s: model.dynamics(s, interval), m, transform.offsets(P))
+        m, P = moments.mean, moments.covariance + model.process_noise.covariance(interval)
+        x = model.dynamics(x, interval)
+        read = transform.moments(lambda s: model.observation(s, None), m, transform.offsets(P))
+        sd = jnp.sqrt(jnp.diagonal(read.covariance + R))
+        return (x, m, P), (model.observation(x, None), read.mean, sd, x, m, P)
+
+    _, ahead = jax.lax.scan(step, (m, m, P), intervals_between(grid))
+    return Forecast(grid[1:], *ahead)

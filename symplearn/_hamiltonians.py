@@ -1,0 +1,222 @@
+"""Hamiltonians that are linear in what they learn: monomials or Legendre products. Dissertation sec. 5.4."""
+
+import abc
+import functools
+import itertools
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+import integrators as ig
+
+
+class AbstractBasis(eqx.Module):
+    """Polynomials B_0 = 1, B_1, ... of one variable, from which products over the variables are made."""
+
+    @abc.abstractmethod
+    def values(self, z: Float[Array, " variable"], degree: int) -> Float[Array, "degree+1 variable"]:
+        """B_n(z_i) for n = 0..degree."""
+
+    @abc.abstractmethod
+    def slopes(self, degree: int) -> np.ndarray:
+        """The matrix M (degree + 1, degree + 1) of the derivatives: B_n' = sum_m M[n, m] B_m, before
+        scaling."""
+
+    @abc.abstractmethod
+    def scales(self, variables: int) -> Float[Array, " variable"]:
+        """The length by which each variable is divided."""
+
+    @abc.abstractmethod
+    def written(self, name: str, power: int) -> str:
+        """B_power of the variable called `name`."""
+
+
+class Monomials(AbstractBasis):
+    """1, z, z^2, ..."""
+
+    def values(self, z: Float[Array, " variable"], degree: int) -> Float[Array, "degree+1 variable"]:
+        return jnp.cumprod(jnp.concatenate([jnp.ones((1, z.shape[0])), jnp.tile(z, (degree, 1))]), axis=0)
+
+    def slopes(self, degree: int) -> np.ndarray:
+        return np.diag(np.arange(1.0, degree + 1), k=-1)
+
+    def scales(self, variables: int) -> Float[Array, " variable"]:
+        return jnp.ones(variables)
+
+    def written(self, name: str, power: int) -> str:
+        return name if power == 1 else f"{name}^{power}"
+
+
+MONOMIALS = Monomials()
+
+
+class Legendre(AbstractBasis):
+    """Legendre polynomials of z / box, orthogonal on [-box, box]; better conditioned than monomials there.
+
+    `box` is the half-width, one number for all variables or one for each.
+    """
+
+    box: tuple[float, ...] | float = eqx.field(static=True, default=1.0)
+
+    def scales(self, variables: int) -> Float[Array, " variable"]:
+        return jnp.broadcast_to(jnp.asarray(self.box, dtype=float), (variables,))
+
+    def values(self, z: Float[Array, " variable"], degree: int) -> Float[Array, "degree+1 variable"]:
+        x = z / self.scales(z.shape[0])
+        table = [jnp.ones_like(x), x]
+        for n in range(1, degree):
+            table.append(((2 * n + 1) * x * table[n] - n * table[n - 1]) / (n + 1))
+        return jnp.stack(table[: degree + 1])
+
+    def slopes(self, degree: int) -> np.ndarray:
+        # P_n' = sum of (2 m + 1) P_m over m = n - 1, n - 3, ...
+        n, m = np.indices((degree + 1, degree + 1))
+        return np.where((m < n) & ((n - m) % 2 == 1), 2.0 * m + 1, 0.0)
+
+    def written(self, name: str, power: int) -> str:
+        return f"P{power}({name})"
+
+
+@functools.cache
+def exponents(variables: int, degree: int, lowest: int = 1) -> np.ndarray:
+    """The powers of all products of total degree `lowest`..`degree`, (term, variable), low degrees first."""
+    rows = []
+    for total in range(lowest, degree + 1):
+        for chosen in itertools.combinations_with_replacement(range(variables), total):
+            rows.append(np.bincount(np.array(chosen, dtype=int), minlength=variables))
+    return np.array(rows, dtype=int).reshape(-1, variables)
+
+
+@functools.cache
+def _derivative_table(basis: AbstractBasis, variables: int, degree: int) -> np.ndarray:
+    """T (variable, lower term, term): d(term)/dz_i = sum over lower terms of T[i, lower, term] times them."""
+    high, low = exponents(variables, degree), exponents(variables, degree - 1, 0)
+    slopes = basis.slopes(degree)
+    table = np.zeros((variables, len(low), len(high)))
+    for i in range(variables):
+        others = np.delete(high, i, axis=1)[None] == np.delete(low, i, axis=1)[:, None]
+        table[i] = others.all(axis=2) * slopes[high[None, :, i], low[:, None, i]]
+    return table
+
+
+def _products(basis: AbstractBasis, z: Array, powers: np.ndarray) -> Array:
+    """The basis products with these powers at z."""
+    # Multiplied one by one: the derivative of `prod` is slow, or divides by zero.
+    values = basis.values(z, int(powers.max(initial=0)))
+    features = jnp.ones(len(powers))
+    for i in range(powers.shape[1]):
+        features = features * values[powers[:, i], i]
+    return features
+
+
+def _polynomial(basis: AbstractBasis, coefficients: Array, z: Array, degree: int) -> Array:
+    return coefficients @ _products(basis, z, exponents(z.shape[0], degree))
+
+
+def _gradient(basis: AbstractBasis, coefficients: Array, z: Array, degree: int) -> Array:
+    """The gradient as one product of a weight matrix and lower features, much cheaper than
+    differentiating."""
+    variables = z.shape[0]
+    lower = _products(basis, z, exponents(variables, degree - 1, 0))
+    weights = jnp.asarray(_derivative_table(basis, variables, degree)) @ coefficients
+    return (weights @ lower) / basis.scales(variables)
+
+
+def _terms(basis: AbstractBasis, names: list[str], degree: int) -> tuple[str, ...]:
+    def written(row):
+        return " ".join(basis.written(name, power) for name, power in zip(names, row, strict=True) if power)
+
+    return tuple(written(row) for row in exponents(len(names), degree))
+
+
+def _equation(left: str, constant: str, coefficients: Any, terms: tuple[str, ...]) -> str:
+    numbers = np.asarray(getattr(coefficients, "value", coefficients))
+    parts = [f"{number:+.6g} {term}" for number, term in zip(numbers, terms, strict=True) if number]
+    return f"{left} = " + " ".join([constant, *parts] if constant else parts or ["0"])
+
+
+def _names(letter: str, dim: int) -> list[str]:
+    return [letter] if dim == 1 else [f"{letter}{i}" for i in range(dim)]
+
+
+def _coefficients(given: Any, terms: int) -> Any:
+    """Zeros where none are given: a random start of a cubic potential lets trajectories escape."""
+    if given is None:
+        return jnp.zeros(terms)
+    return given if isinstance(given, eqx.Module) else jnp.asarray(given, dtype=float)
+
+
+class PolynomialPotential(ig.AbstractSeparableHamiltonian):
+    """H = p'p / 2 + U(q) with U all products of total degree 1..`degree`. Dissertation (5.3), (5.21).
+
+    **Arguments:** `dim` - degrees of freedom; `degree`; `coefficients` - (term,) in the order of `terms`,
+    zeros if left out; `basis` - `Monomials()` or `Legendre(box)`. It prints as an equation.
+    """
+
+    dim: int = eqx.field(static=True)
+    degree: int = eqx.field(static=True)
+    coefficients: Any
+    basis: AbstractBasis
+
+    def __init__(self, dim: int, degree: int, coefficients: Any = None, basis: AbstractBasis = MONOMIALS):
+        self.dim, self.degree, self.basis = dim, degree, basis
+        self.coefficients = _coefficients(coefficients, len(exponents(dim, degree)))
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """The terms in words, in the order of the coefficients."""
+        return _terms(self.basis, _names("q", self.dim), self.degree)
+
+    def kinetic(self, p: Float[Array, " d"]) -> Float[Array, ""]:
+        return 0.5 * p @ p
+
+    def potential(self, q: Float[Array, " d"]) -> Float[Array, ""]:
+        return _polynomial(self.basis, self.coefficients, q, self.degree)
+
+    def velocity(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
+        return p
+
+    def slope(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
+        return _gradient(self.basis, self.coefficients, q, self.degree)
+
+    def __str__(self) -> str:
+        return _equation("H(q, p)", "p'p/2", self.coefficients, self.terms)
+
+
+class Polynomial(ig.AbstractHamiltonian):
+    """H(q, p) of all products of total degree 1..`degree` in the variables [q, p]. Dissertation sec. 5.4.2.
+
+    Arguments as for `PolynomialPotential`. With dim 2 and degree 3 there are 34 terms.
+    """
+
+    dim: int = eqx.field(static=True)
+    degree: int = eqx.field(static=True)
+    coefficients: Any
+    basis: AbstractBasis
+
+    def __init__(self, dim: int, degree: int, coefficients: Any = None, basis: AbstractBasis = MONOMIALS):
+        self.dim, self.degree, self.basis = dim, degree, basis
+        self.coefficients = _coefficients(coefficients, len(exponents(2 * dim, degree)))
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """The terms in words, in the order of the coefficients."""
+        return _terms(self.basis, _names("q", self.dim) + _names("p", self.dim), self.degree)
+
+    def energy(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, ""]:
+        return _polynomial(self.basis, self.coefficients, jnp.concatenate([q, p]), self.degree)
+
+    def velocity(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
+        return self._gradient(q, p)[self.dim :]
+
+    def slope(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
+        return self._gradient(q, p)[: self.dim]
+
+    def _gradient(self, q: Array, p: Array) -> Array:
+        return _gradient(self.basis, self.coefficients, jnp.concatenate([q, p]), self.degree)
+
+    def __str__(self) -> str:
+        return _equation("H(q, p)", "", self.coefficients, self.terms)

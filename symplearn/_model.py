@@ -1,0 +1,119 @@
+"""State-space models: dynamics, observation, noises and the initial state. Dissertation (2.1), (2.5)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PyTree
+
+import integrators as ig
+
+from ._parameters import AbstractKnown
+
+
+class Gaussian(AbstractKnown):
+    """A normal distribution: `mean` of shape (d,) and `covariance` of shape (d, d), which may be singular.
+
+    Bare arrays are known; `Gaussian(Learnt(mean), covariance)` learns the mean.
+    """
+
+    mean: Any
+    covariance: Any
+
+
+class Interval(eqx.Module):
+    """The data interval between two readings: its `start` and its `end`, in the recording's time unit."""
+
+    start: Float[Array, "..."]
+    end: Float[Array, "..."]
+
+    @property
+    def length(self) -> Float[Array, "..."]:
+        """The interval's duration."""
+        return self.end - self.start
+
+
+def intervals_between(times: Float[Array, " time"]) -> Interval:
+    """The data intervals of n times, one record with leading axis n - 1."""
+    times = jnp.asarray(times)
+    return Interval(times[:-1], times[1:])
+
+
+class Propagator(eqx.Module):
+    """A system stepped by an integrator over one data interval: Psi in (2.5).
+
+    The state is lifted once per data interval, stepped `substeps` times and projected back (5.18).
+
+    **Arguments:** `system` - a Hamiltonian or a forced system of `integrators`; `integrator` - for example
+    `integrators.Leapfrog()`; `substeps` - integrator steps per data interval, a whole number of at least 1.
+
+    **Raises:** `TypeError` where the integrator cannot step the system.
+    """
+
+    system: Any
+    integrator: Any
+    substeps: int = eqx.field(static=True, default=1)
+
+    def __check_init__(self):
+        if self.substeps < 1:
+            raise ValueError(f"`Propagator` needs at least one substep, but was given {self.substeps}.")
+        self.integrator.accepts(self.system)
+
+    def __call__(self, x: Float[Array, " state"], interval: Interval) -> Float[Array, " state"]:
+        return ig.propagate(self.system, self.integrator, x, interval.start, interval.end, self.substeps)
+
+
+class FullState(eqx.Module):
+    """The whole state is read: h(x) = x."""
+
+    def __call__(self, x: Float[Array, " state"], context: Any = None) -> Float[Array, " state"]:
+        return x
+
+
+class Coordinates(eqx.Module):
+    """Some entries of the state are read: h(x) = x[indices]; `Coordinates((0,))` reads q_0 of [q, p]."""
+
+    indices: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, x: Float[Array, " state"], context: Any = None) -> Float[Array, " channel"]:
+        return x[jnp.asarray(self.indices)]
+
+
+class LinearObservation(eqx.Module):
+    """A linear reading of the state: h(x) = matrix @ x, matrix of shape (channel, state)."""
+
+    matrix: Any
+
+    def __call__(self, x: Float[Array, " state"], context: Any = None) -> Float[Array, " channel"]:
+        return self.matrix @ x
+
+
+class StateSpaceModel(eqx.Module):
+    """A hidden Markov model with additive Gaussian noise. Dissertation (2.5).
+
+    x_{k+1} = dynamics(x_k, interval_k) + xi_k,  y_k = observation(x_k, context_k) + eta_k,  x_0 ~ initial.
+
+    **Arguments:**
+    - `dynamics`: a module `(x, interval) -> x'`. `interval` is one slice of a pytree whose leading axis
+      counts the data intervals, as an `Interval` or the caller's own record.
+    - `observation`: a module `(x, context) -> y`. `context` is one slice of a pytree over the readings, or
+      None.
+    - `process_noise`: a module with `covariance(interval)` of shape (state, state).
+    - `measurement_noise`: a module with `covariance()` of shape (channel, channel).
+    - `initial`: a `Gaussian` for the state at the first reading. None means a flat prior, which only a model
+      that reads its `FullState` can have: the first reading is then conditioned on (Remark 1 after Theorem
+      2).
+    """
+
+    dynamics: Callable[[Any, Any], Any]
+    observation: Callable[[Any, Any], Any]
+    process_noise: Any
+    measurement_noise: Any
+    initial: Gaussian | None = None
+
+
+def slice_at(records: PyTree, k: int | Int[Array, ""]) -> PyTree:
+    """Slice k of a pytree along its leading axis."""
+    return jax.tree.map(lambda leaf: leaf[k], records)

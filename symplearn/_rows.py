@@ -1,0 +1,122 @@
+"""A recording laid out for stepping: thinned rows, spans between them, inputs averaged over every substep."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from ._augmented import Span
+from ._thinning import Thinned, thin, thinning_width
+
+# A gap this much wider than the usual one is bridged by rows without readings, so that one substep fits all spans.
+_WIDE = 1.5
+
+
+class HasRows(Protocol):
+    """What is asked of a recording: times (n,), readings (n, m) with NaN for missing, inputs or None."""
+
+    @property
+    def times(self) -> np.ndarray: ...
+    @property
+    def readings(self) -> np.ndarray: ...
+    @property
+    def inputs(self) -> Any: ...
+
+
+@dataclass(frozen=True)
+class Rows:
+    """One recording ready to be stepped through.
+
+    `readings` (n, m) are NaN where there is none; `counts` (n, m) tell how many original readings each one averages.
+    The first `fitted` rows are for fitting, the others are held out. `spans` has n - 1 entries.
+    """
+
+    times: Float[np.ndarray, " time"]
+    readings: Float[np.ndarray, "time channel"]
+    counts: Float[np.ndarray, "time channel"]
+    spans: Span
+    inputs: Float[np.ndarray, "time input"]
+    fitted: int
+    given: int  # rows before thinning
+    used: int  # rows after thinning, without those that bridge gaps
+    boundary: float  # time of the last fitted row of the recording
+
+    @property
+    def contexts(self) -> tuple[Any, Any]:
+        """What the observation is given besides the state, row by row."""
+        return jnp.asarray(self.times), jnp.asarray(self.inputs)
+
+
+def lay_out(recordings: Sequence[HasRows], holdout: float, width: float, substep: float) -> list[Rows]:
+    """Thin recordings into bins of `width`, split off the held-out parts, and lay spans of at most `substep`.
+
+    All recordings get the same number of substeps per span, so that one compiled function serves them all.
+    """
+    thinned = [_thinned(recording, holdout, width) for recording in recordings]
+    pieces = max(math.ceil(np.median(np.diff(rows.times)) / substep - 1e-9) for rows, _ in thinned)
+    return [
+        _one(recording, rows, first, max(1, pieces), holdout)
+        for recording, (rows, first) in zip(recordings, thinned, strict=True)
+    ]
+
+
+def _fitted_count(n: int, holdout: float) -> int:
+    return max(n - math.floor(n * holdout + 1e-9), 2)
+
+
+def _thinned(recording: HasRows, holdout: float, width: float) -> tuple[Thinned, int]:
+    """Fitted and held-out rows thinned apart, end to end, and how many of them are fitted."""
+    n = len(recording.times)
+    keep = _fitted_count(n, holdout)
+    parts = [thin(recording.times[a:b], recording.readings[a:b], width) for a, b in ((0, keep), (keep, n)) if b > a]
+    joined = (np.concatenate([getattr(part, f) for part in parts]) for f in ("times", "readings", "counts"))
+    return Thinned(*joined), len(parts[0].times)
+
+
+def _one(recording: HasRows, rows: Thinned, first: int, pieces: int, holdout: float) -> Rows:
+    places, times = _bridged(rows.times, float(np.median(np.diff(rows.times))))
+    readings, counts = (np.full((len(times), rows.readings.shape[1]), fill) for fill in (np.nan, 0.0))
+    readings[places], counts[places] = rows.readings, rows.counts
+    return Rows(
+        times=times,
+        readings=readings,
+        counts=counts,
+        spans=_spans(times, pieces, recording.inputs),
+        inputs=_at(recording.inputs, times),
+        fitted=int(places[first - 1]) + 1,
+        given=len(recording.times),
+        used=len(rows.times),
+        boundary=float(recording.times[_fitted_count(len(recording.times), holdout) - 1]),
+    )
+
+
+def bin_width(recordings: Sequence[HasRows]) -> float:
+    """One width for all recordings: the narrowest that any of them that needs thinning asks for."""
+    widths = [thinning_width(r.times, r.readings) for r in recordings]
+    return min((w for w in widths if w > 0), default=0.0)
+
+
+def _bridged(times: np.ndarray, usual: float) -> tuple[Int[np.ndarray, " row"], np.ndarray]:
+    """Times with wide gaps filled, and where the rows stand in them."""
+    pieces = np.maximum(1, np.ceil(np.diff(times) / (_WIDE * usual) - 1e-9)).astype(int)
+    places = np.concatenate([[0], np.cumsum(pieces)])
+    return places, np.interp(np.arange(places[-1] + 1), places, times)
+
+
+def _spans(times: np.ndarray, pieces: int, inputs: Any) -> Span:
+    step = np.diff(times) / pieces
+    edges = times[:-1, None] + step[:, None] * np.arange(pieces + 1)
+    if inputs is None:
+        values = np.zeros((len(step), pieces, 0))
+    else:
+        flat = inputs.mean_over(edges[:, :-1].ravel(), edges[:, 1:].ravel())
+        values = flat.reshape(len(step), pieces, -1)
+    return Span(jnp.asarray(times[:-1]), jnp.asarray(step), jnp.asarray(values))
+
+
+def _at(inputs: Any, times: np.ndarray) -> np.ndarray:
+    return np.zeros((len(times), 0)) if inputs is None else np.asarray(inputs.at(times))

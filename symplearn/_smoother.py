@@ -1,0 +1,143 @@
+"""The unscented Rauch-Tung-Striebel smoother and its auxiliary residuals: the trace of left-out physics.
+
+Written with the adjoint of the state (Bryson and Frazier 1963; de Jong 1988), which needs no inverse of a
+covariance, so that models without process noise have auxiliary residuals too.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from ._filter import STANDARD, Filtered, UnscentedTransform, semidefinite_cholesky
+from ._model import StateSpaceModel
+
+# Where the state is known exactly, slopes are central differences over this share of the state's size.
+_NUDGE = 1e-5
+
+
+class Smoothed(eqx.Module):
+    """The state and the noises given the whole recording, at n readings and over n - 1 data intervals.
+
+    `disturbances` are E[xi_k | Y] for x_{k+1} = Psi(x_k) + xi_k and `residuals` E[eta_k | Y] for
+    y_k = h(x_k) + eta_k; their `*_covariances` are those of the noises given Y. The `standardised_*` are
+    divided by the standard deviation of the estimate itself: each is N(0, 1) where the model is right, one
+    series per state equation and one per channel. They exist without process noise too, as limits. Harvey
+    and Koopman (1992). Residuals of missing readings are 0; see `observed`.
+    """
+
+    means: Float[Array, "time state"]
+    covariances: Float[Array, "time state state"]
+    disturbances: Float[Array, "interval state"]
+    disturbance_covariances: Float[Array, "interval state state"]
+    standardised_disturbances: Float[Array, "interval state"]
+    residuals: Float[Array, "time channel"]
+    residual_covariances: Float[Array, "time channel channel"]
+    standardised_residuals: Float[Array, "time channel"]
+    observed: Bool[Array, "time channel"]
+
+
+class _Adjoint(NamedTuple):
+    """r and N: the smoothed state is m + P r with covariance P - P N P; N is the variance of r."""
+
+    r: Array
+    N: Array
+
+
+def smooth(
+    model: StateSpaceModel,
+    filtered: Filtered,
+    intervals: PyTree,
+    contexts: PyTree = None,
+    transform: UnscentedTransform = STANDARD,
+) -> Smoothed:
+    """Smooth what `unscented_filter` filtered; give the same model, intervals, contexts and transform.
+
+    Sarkka (2008) for the unscented smoother. On a linear model everything is exact.
+    """
+    A = jax.vmap(lambda m, P, interval: _slope(lambda x: model.dynamics(x, interval), m, P, transform))(
+        filtered.filtered_means[:-1], filtered.filtered_covariances[:-1], intervals
+    )
+    H = _observation_slopes(model, filtered, contexts, transform)
+    S_inverse = jax.vmap(_masked_inverse)(filtered.innovation_covariances, filtered.observed)
+    K = jnp.einsum("kij,kcj,kcd->kid", filtered.predicted_covariances, H, S_inverse)
+    predicted, corrected = _sweep(A, H, K, S_inverse, filtered.innovations)
+    means, covariances = jax.vmap(_state)(filtered.filtered_means, filtered.filtered_covariances, corrected)
+    Q = jax.vmap(model.process_noise.covariance)(intervals)
+    later = jax.tree.map(lambda leaf: leaf[1:], predicted)
+    xi = jax.vmap(_noise_given_all)(Q, later.r, later.N)
+    u = jnp.einsum("kcd,kd->kc", S_inverse, filtered.innovations) - jnp.einsum("kic,ki->kc", K, corrected.r)
+    D = S_inverse + jnp.einsum("kic,kij,kjd->kcd", K, corrected.N, K)
+    R = model.measurement_noise.covariance()
+    eta = jax.vmap(lambda u, D: _noise_given_all(R, u, D))(u, D)
+    standardised = jnp.where(filtered.observed, eta[2], 0.0)
+    return Smoothed(*(means, covariances, *xi, *eta[:2], standardised, filtered.observed))
+
+
+def _slope(function, m, P, transform):
+    """The statistical slope Cov[f(x), x] P^-1, by central differences along the columns of L.
+
+    Where P is singular its missing columns are filled with small steps along the axes.
+    """
+    L = semidefinite_cholesky(P)
+    step = _NUDGE * jnp.maximum(1.0, jnp.abs(m))
+    L = L + jnp.diag(jnp.where(jnp.diagonal(L) > 0.0, 0.0, step))
+    half = transform.spread(m.shape[0]) ** 0.5 * L.T
+    outputs = jax.vmap(function)(jnp.concatenate([m + half, m - half]))
+    differences = 0.5 * (outputs[: m.shape[0]] - outputs[m.shape[0] :])
+    return jax.scipy.linalg.solve_triangular(half, differences, lower=False).T
+
+
+def _observation_slopes(model, filtered, contexts, transform):
+    def slope(m, P, context, seen):
+        H = _slope(lambda x: model.observation(x, context), m, P, transform)
+        return jnp.where(seen[:, None], H, 0.0)
+
+    moments = filtered.predicted_means, filtered.predicted_covariances
+    return jax.vmap(slope)(*moments, contexts, filtered.observed)
+
+
+def _masked_inverse(S, seen):
+    """The inverse of the innovation covariance of the channels that were read, 0 elsewhere."""
+    both = seen[:, None] & seen[None, :]
+    filled = jnp.where(both, S, jnp.diag(jnp.ones(S.shape[0])))
+    return jnp.where(both, jnp.linalg.inv(filled), 0.0)
+
+
+def _sweep(A, H, K, S_inverse, innovations):
+    """Backward through time: the adjoints before and after each reading."""
+    size = K.shape[1]
+    end = _Adjoint(jnp.zeros(size), jnp.zeros((size, size)))
+    A = jnp.concatenate([A, jnp.zeros((1, size, size))])
+
+    def step(later, data):
+        A, H, K, S_inverse, v = data
+        corrected = _Adjoint(A.T @ later.r, A.T @ later.N @ A)
+        keep = jnp.eye(size) - K @ H
+        r = H.T @ S_inverse @ v + keep.T @ corrected.r
+        N = H.T @ S_inverse @ H + keep.T @ corrected.N @ keep
+        predicted = _Adjoint(r, 0.5 * (N + N.T))
+        return predicted, (predicted, corrected)
+
+    _, adjoints = jax.lax.scan(step, end, (A, H, K, S_inverse, innovations), reverse=True)
+    return adjoints
+
+
+def _state(m, P, adjoint):
+    covariance = P - P @ adjoint.N @ P
+    return m + P @ adjoint.r, 0.5 * (covariance + covariance.T)
+
+
+def _noise_given_all(Q, r, N):
+    """Mean and covariance of a noise given all readings, and its mean in units of its own standard deviation.
+
+    With diagonal Q the last is r_i / sqrt(N_ii), which stays meaningful where Q_ii is 0.
+    """
+    mean, spread = Q @ r, Q @ N @ Q
+    moves = jnp.diagonal(Q) > 0.0
+    variance = jnp.where(moves, jnp.diagonal(spread), jnp.diagonal(N))
+    known = variance > 0.0
+    scores = jnp.where(moves, mean, r) / jnp.sqrt(jnp.where(known, variance, 1.0))
+    return mean, Q - spread, jnp.where(known, scores, 0.0)

@@ -1,0 +1,167 @@
+"""A remainder in the sensor: readings whose error is white noise plus a stationary process with a memory.
+
+The process is the damped oscillator of second order driven by white noise: rough like Ornstein-Uhlenbeck's at strong
+damping, smooth like Matern's of order 3/2 at critical damping, nearly periodic at weak damping. A Kalman filter
+for it whitens residuals and sensitivities alike, so one pass gives the Gram matrix from which generalised least
+squares and the evidence follow (Jones 1980; Harvey 1989, section 3.4; Sarkka and Solin 2019, section 12.3).
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+# Variance of the coloured error against the white one, its damping, and how many memory lengths are tried.
+_RATIOS = np.geomspace(0.03, 1e6, 12)
+_DAMPINGS = (30.0, 1.001, 0.3, 0.1)
+_TIMES = 10
+# Rows that the grid is searched with; more would not tell the colour better.
+_ROWS = 4000
+
+
+@dataclass(frozen=True)
+class Colour:
+    """The coloured error of one channel.
+
+    `ratio` is its variance over the white one, `frequency` in rad/time, `damping` relative to critical. `occam` is
+    the log of the grid's mean likelihood relative to its largest: what the choice on the grid costs.
+    """
+
+    ratio: float
+    frequency: float
+    damping: float
+    occam: float
+
+
+def _transition(gap: Array, frequency: Array, damping: Array) -> Array:
+    """exp of the damped oscillator's matrix over `gap`, without overflow at strong damping. Shape (2, 2)."""
+    rate = damping * frequency
+    split = frequency * jnp.sqrt(jnp.abs(damping**2 - 1))
+    slow, fast = jnp.exp(-(rate - split) * gap), jnp.exp(-(rate + split) * gap)
+    fade = jnp.exp(-rate * gap)
+    over = damping > 1
+    c = jnp.where(over, 0.5 * (slow + fast), fade * jnp.cos(split * gap))
+    s = jnp.where(over, 0.5 * (slow - fast), fade * jnp.sin(split * gap)) / split
+    return jnp.array([[c + rate * s, s], [-(frequency**2) * s, c - rate * s]])
+
+
+def _filter(columns, variances, gaps, ratio, frequency, damping, visit, start):
+    """Filter the error's state for every column; `visit(total, e, S)` gathers innovations, `start` its first value."""
+    stationary = ratio * jnp.diag(jnp.stack([jnp.ones_like(frequency), frequency**2]))
+
+    def step(carry, data):
+        M, P, total, logs = carry
+        y, r, gap = data
+        seen = r > 0
+        S = jnp.where(seen, P[0, 0] + r, 1.0)
+        e = jnp.where(seen, y - M[0], 0.0)
+        K = jnp.where(seen, P[:, 0] / S, 0.0)
+        total, kept = visit(total, e, S)
+        M, P = M + K[:, None] * e, P - jnp.outer(K, K) * S
+        F = _transition(gap, frequency, damping)
+        P = stationary + F @ (P - stationary) @ F.T
+        return (F @ M, P, total, logs + jnp.where(seen, jnp.log(S), 0.0)), kept
+
+    begin = (jnp.zeros((2, columns.shape[0])), stationary, start, jnp.zeros(()))
+    (_, _, total, logs), kept = jax.lax.scan(step, begin, (columns.T, variances, gaps))
+    return total, logs, kept
+
+
+def _squares(columns, variances, gaps, ratio, frequency, damping):
+    def visit(total, e, S):
+        return total + e[0] ** 2 / S, None
+
+    return _filter(columns, variances, gaps, ratio, frequency, damping, visit, jnp.zeros(()))[:2]
+
+
+def _gram(columns, variances, gaps, ratio, frequency, damping):
+    def visit(total, e, S):
+        return total + jnp.outer(e, e) / S, None
+
+    size = columns.shape[0]
+    return _filter(columns, variances, gaps, ratio, frequency, damping, visit, jnp.zeros((size, size)))[:2]
+
+
+@jax.jit
+def _series(columns, variances, gaps, ratio, frequency, damping):
+    def visit(total, e, S):
+        return total, e / jnp.sqrt(S)
+
+    return _filter(columns, variances, gaps, ratio, frequency, damping, visit, jnp.zeros(()))[2]
+
+
+_on_grid = jax.jit(jax.vmap(jax.vmap(_squares, (None, None, None, 0, 0, 0)), (0, None, None, None, None, None)))
+_grams = jax.jit(jax.vmap(_gram, (0, None, None, 0, 0, 0)))
+
+
+def _variances(weight: np.ndarray) -> Array:
+    """White variance of every row in units of one reading's; 0 marks a missing one."""
+    return jnp.asarray(np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0))
+
+
+def _gaps(times: np.ndarray) -> Array:
+    return jnp.asarray(np.append(np.diff(times), 0.0))
+
+
+def _grid(times: list[np.ndarray]) -> np.ndarray:
+    """Every (ratio, frequency, damping) that is tried: memories from one gap to a quarter of the recording."""
+    gap = min(float(np.median(np.diff(t))) for t in times)
+    memories = np.geomspace(gap, max(t[-1] - t[0] for t in times) / 4, _TIMES)
+    return np.array([(r, max(2 * z, 1.0) / m, z) for z in _DAMPINGS for m in memories for r in _RATIOS])
+
+
+def fit_colour(
+    residuals: list[Float[np.ndarray, "lane time"]],
+    weight: list[Float[np.ndarray, " time"]],
+    times: list[Float[np.ndarray, " time"]],
+    known: float | None,
+) -> list[Colour]:
+    """The best coloured error of one channel for every lane, all recordings together.
+
+    **Arguments:** - `residuals`: by recording, in the reading's unit. - `known`: the white noise's sd where the file
+    gives it; None where it is profiled out.
+    """
+    grid = _grid(times)
+    ratio, frequency, damping = (jnp.asarray(grid[:, i]) for i in range(3))
+    square, logs, number = 0.0, 0.0, 0
+    for x, w, t in zip(residuals, weight, times, strict=True):
+        some = slice(max(0, (len(t) - _ROWS) // 2), max(0, (len(t) - _ROWS) // 2) + _ROWS)
+        a, b = _on_grid(jnp.asarray(x[:, None, some]), _variances(w[some]), _gaps(t[some]), ratio, frequency, damping)
+        square, logs, number = square + np.asarray(a), logs + np.asarray(b), number + int((w[some] > 0).sum())
+    if known is None:
+        value = -0.5 * (number * np.log(np.maximum(square, 1e-300) / number) + logs)
+    else:
+        value = -0.5 * (square / known**2 + logs)
+    return [_chosen(grid, np.where(np.isfinite(v), v, -np.inf)) for v in value]
+
+
+def _chosen(grid: np.ndarray, values: np.ndarray) -> Colour:
+    best = int(values.argmax())
+    if not np.isfinite(values[best]):
+        return Colour(*grid[0], -np.inf)
+    return Colour(*grid[best], float(np.log(np.mean(np.exp(values - values[best])))))
+
+
+def whitened_gram(
+    columns: Float[np.ndarray, "lane column time"],
+    weight: Float[np.ndarray, " time"],
+    times: Float[np.ndarray, " time"],
+    colours: list[Colour],
+) -> tuple[Float[np.ndarray, "lane column column"], Float[np.ndarray, " lane"]]:
+    """Gram matrix of the whitened columns in units of the white variance, and the sum of log innovation variances."""
+    shape = (jnp.asarray([getattr(c, f) for c in colours]) for f in ("ratio", "frequency", "damping"))
+    total, logs = _grams(jnp.asarray(columns), _variances(weight), _gaps(times), *shape)
+    return np.asarray(total), np.asarray(logs)
+
+
+def whitened_series(
+    columns: Float[np.ndarray, "column time"],
+    weight: Float[np.ndarray, " time"],
+    times: Float[np.ndarray, " time"],
+    colour: Colour,
+) -> Float[np.ndarray, "time column"]:
+    """The whitened columns of one lane, row by row, in units of the white sd."""
+    shape = (jnp.asarray(x) for x in (colour.ratio, colour.frequency, colour.damping))
+    return np.asarray(_series(jnp.asarray(columns), _variances(weight), _gaps(times), *shape))

@@ -1,0 +1,90 @@
+"""Evidence of one combination of effects: Laplace's integral over the unknowns, from a Gram matrix of innovations."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.stats import multivariate_normal, norm
+
+# Probabilities of a half space below this are as good as impossible.
+_TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class Laplace:
+    """A Gaussian posterior around `z + step`, and the log evidence in nats, half-priors of signed effects included."""
+
+    log_evidence: float
+    step: Float[np.ndarray, " z"]
+    covariance: Float[np.ndarray, "z z"]  # zero where nothing is free
+
+
+def laplace(
+    gram: Float[np.ndarray, "column column"],
+    offset: float,
+    z: Float[np.ndarray, " z"],
+    mean: Float[np.ndarray, " z"],
+    precision: Float[np.ndarray, " z"],
+    active: Bool[np.ndarray, " z"],
+    lower: dict[int, float],
+) -> Laplace:
+    """Integrate exp(offset - |e0 - E d|^2 / 2) times the priors over the step d, exactly where e is linear.
+
+    **Arguments:** - `gram`: of the columns [e0, E]. - `offset`: minus half of what does not depend on d. - `lower`: the
+    entries of z that are physical only above a bound; prior and posterior are cut off there.
+    """
+    a = np.nonzero(active)[0]
+    matrix = gram[1:, 1:][np.ix_(a, a)] + np.diag(precision[a])
+    vector = gram[0, 1:][a] - precision[a] * (z - mean)[a]
+    scale = np.sqrt(np.maximum(np.diag(matrix), _TINY))
+    scaled = matrix / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(scaled)
+    values = np.maximum(values, 1e-13)  # a direction that neither data nor prior hold keeps a wide, finite spread
+    inverse = (vectors / values) @ vectors.T / np.outer(scale, scale)
+    step = inverse @ vector
+    square = gram[0, 0] + (precision[a] * (z - mean)[a] ** 2).sum() - vector @ step
+    held = precision[a][precision[a] > 0]
+    log_determinant = np.log(values).sum() + 2 * np.log(scale).sum()
+    value = offset - 0.5 * square + 0.5 * np.log(held).sum() - 0.5 * log_determinant
+    full_step, covariance = np.zeros(len(z)), np.zeros((len(z), len(z)))
+    full_step[a] = step
+    covariance[np.ix_(a, a)] = inverse
+    value += _half_spaces(z + full_step, covariance, mean, precision, lower)
+    return Laplace(float(value) if np.isfinite(value) else -np.inf, full_step, covariance)
+
+
+def _half_spaces(
+    centre: np.ndarray, covariance: np.ndarray, mean: np.ndarray, precision: np.ndarray, lower: dict[int, float]
+) -> float:
+    """Log posterior mass over log prior mass of the region that signs allow."""
+    if not lower:
+        return 0.0
+    places, bounds = np.array(list(lower)), np.array(list(lower.values()))
+    sd = np.sqrt(np.diag(covariance)[places])
+    reach = (centre[places] - bounds) / sd
+    if len(places) == 1:
+        mass = float(norm.logcdf(reach[0]))
+    elif reach.min() < -6:
+        mass = float(norm.logcdf(reach.min()))  # the most forbidden one alone decides, to leading order
+    else:
+        correlation = covariance[np.ix_(places, places)] / np.outer(sd, sd) + 1e-10 * np.eye(len(places))
+        joint = multivariate_normal.cdf(reach, cov=correlation, allow_singular=True, rng=np.random.default_rng(0))
+        mass = float(np.log(max(joint, _TINY)))
+    prior = norm.logcdf((mean[places] - bounds) * np.sqrt(precision[places])).sum()
+    return mass - float(prior)
+
+
+def variance_inflation(scores: Float[np.ndarray, "time z"], blocks: int = 24) -> float:
+    """How much larger the variance of the summed score is over blocks of time than whitened rows would have it.
+
+    One where the remainder was whitened rightly; large where it is not white on the scale of the motion, so that
+    Bayes factors claim more than the data hold (a batch-means estimate of the long-run variance; Geyer 1992).
+    """
+    scores = scores[:, np.abs(scores).sum(0) > 0]
+    size = len(scores) // blocks
+    if size < 4 or scores.shape[1] == 0:
+        return 1.0
+    sums = scores[: size * blocks].reshape(blocks, size, -1).sum(1)
+    between = sums.var(0, ddof=1) / size
+    within = (scores**2).mean(0)
+    return float(np.median(between / np.maximum(within, _TINY)))

@@ -1,0 +1,135 @@
+"""Fits with a missing force of given intensity: paths and unknowns together, many combinations at once."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ._calibrate import Priors, weights
+from ._evidence import Laplace, laplace
+from ._path import backward_lanes, forward_lanes
+from ._problem import Combination, Problem
+from ._trajectory import LANES, Stepper
+
+# Steps towards a smaller or larger reading noise are lengthened this much: plain EM is slow where noise is small.
+_HASTE = 1.5
+
+
+@dataclass(frozen=True)
+class PathFit:
+    """One combination under one intensity of the missing force: unknowns, noise, path by recording, evidence."""
+
+    combination: Combination
+    intensity: Float[np.ndarray, " d"]
+    z: Float[np.ndarray, " z"]
+    noise: Float[np.ndarray, " channel"]
+    paths: list[Float[np.ndarray, "time state"]]
+    laplace: Laplace | None = None
+    converged: bool = False
+
+
+def fit_paths(
+    stepper: Stepper, starts: Sequence[PathFit], priors: Priors, rows: Sequence[int], iterations: int = 10
+) -> list[PathFit]:
+    """Gauss-Newton on paths and unknowns from given starts, `LANES` of them at a time."""
+    chunks = [list(starts[a : a + LANES]) for a in range(0, len(starts), LANES)]
+    with ThreadPoolExecutor(max(1, stepper.jobs)) as pool:
+        done = pool.map(lambda chunk: _fit_chunk(stepper, chunk, priors, rows, iterations), chunks)
+        return [fit for chunk in done for fit in chunk]
+
+
+def _fit_chunk(stepper, fits: list[PathFit], priors: Priors, rows: Sequence[int], iterations: int) -> list[PathFit]:
+    wanted = len(fits)
+    fits = (fits * LANES)[:LANES] if wanted < LANES else fits
+    weight = weights(stepper.problem, rows)
+    before = np.full(LANES, -np.inf)
+    for count in range(iterations):
+        fits = _iterate(stepper, fits, priors, rows, weight, noisy=count < iterations - 2)
+        now = np.array([fit.laplace.log_evidence for fit in fits])
+        settled = np.abs(now - before) < 0.02
+        if (settled | ~np.isfinite(now)).all():
+            break
+        before = now
+    return [replace(fit, converged=bool(ok)) for fit, ok in zip(fits, settled, strict=True)][:wanted]
+
+
+def _iterate(stepper, fits: list[PathFit], priors: Priors, rows, weight, noisy: bool) -> list[PathFit]:
+    """One forward pass, one step of the unknowns, one backward pass."""
+    problem = stepper.problem
+    passes = [_forward(stepper, fits, r, rows[r], weight[r]) for r in range(len(rows))]
+    steps = [_integrated(problem, fits[b], [(p[2], b) for p in passes], priors, weight) for b in range(LANES)]
+    z = _clipped(problem, np.stack([fit.z + one.step for fit, one in zip(fits, steps, strict=True)]))
+    moved = z - np.stack([fit.z for fit in fits])
+    paths, squares, numbers = [[] for _ in fits], 0.0, 0.0
+    for r, (linear, variances, done) in enumerate(passes):
+        local = problem.local(r)
+        back = backward_lanes(linear, done, variances, jnp.asarray(moved[:, local]))
+        shift = np.asarray(back.shift)
+        squares = squares + (weight[r] * np.asarray(back.noise)).sum(1)
+        numbers = numbers + (weight[r] > 0).sum(0)
+        for b, fit in enumerate(fits):
+            paths[b].append(fit.paths[r] + shift[b])
+    noise = np.stack([fit.noise for fit in fits])
+    if noisy:
+        noise = _next_noise(problem, noise, squares / np.maximum(numbers, 1))
+    return [
+        replace(fit, z=z[b], noise=noise[b], paths=paths[b], laplace=steps[b]) for b, fit in enumerate(fits)
+    ]
+
+
+def _next_noise(problem: Problem, noise: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.sqrt(expected) / noise
+    ratio = np.where(np.isfinite(ratio), np.clip(ratio, 0.3, 3.0), 1.0)
+    return np.where(np.isnan(problem.noise), noise * ratio**_HASTE, noise)
+
+
+def _forward(stepper, fits: list[PathFit], r: int, rows: int, weight: np.ndarray):
+    problem, f, head = stepper.problem, stepper.problem.calibrated.size, stepper.problem.head
+    z = np.stack([fit.z for fit in fits])
+    inverse = np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0)
+    variances = jnp.asarray(np.stack([fit.noise**2 * inverse for fit in fits]))
+    linear, done = forward_lanes(
+        problem.equations,
+        problem.integrator,
+        stepper.courses[r],
+        jnp.asarray(np.stack([fit.paths[r][:rows] for fit in fits])),
+        jnp.asarray(z[:, head : head + f]),
+        jnp.asarray(z[:, head + f :]),
+        jnp.asarray(np.stack([problem.onehot(fit.combination) for fit in fits])),
+        jnp.asarray(problem.rows[r].readings[:rows]),
+        variances,
+        jnp.asarray(np.stack([fit.intensity for fit in fits])),
+    )
+    return linear, variances, done
+
+
+def _integrated(problem: Problem, fit: PathFit, passes, priors: Priors, weight) -> Laplace:
+    """Evidence and step of one lane from its recordings' Gram matrices.
+
+    The columns of the state at the first row are those of x_0, so that its prior and the step are taken together.
+    """
+    size = 1 + problem.size
+    gram, offset = np.zeros((size, size)), 0.0
+    for r, (done, b) in enumerate(passes):
+        place = np.concatenate([[0], 1 + problem.local(r)])
+        # The path's first point is z's own x_0, so a step of x_0 from z is a step of the path's first point.
+        g = np.asarray(done.gram[b])
+        sign = np.ones(len(place))
+        sign[1:] = -1.0
+        gram[np.ix_(place, place)] += g * np.outer(sign, sign)
+        offset -= 0.5 * (float(done.logs[b]) + (weight[r] > 0).sum() * np.log(2 * np.pi))
+    if not np.isfinite(gram).all():
+        return Laplace(-np.inf, np.zeros(problem.size), np.zeros((problem.size, problem.size)))
+    precision = priors.precision_of(problem, fit.combination)
+    return laplace(gram, offset, fit.z, priors.mean, precision, problem.active(fit.combination),
+                   problem.lower_bounds(fit.combination))  # fmt: skip
+
+
+def _clipped(problem: Problem, z: np.ndarray) -> np.ndarray:
+    part = slice(problem.head, problem.head + problem.calibrated.size)
+    z[:, part] = np.clip(z[:, part], problem.calibrated.lower, problem.calibrated.upper)
+    return z

@@ -1,0 +1,156 @@
+"""A remainder in the dynamics: a white missing force, and the most probable path that it takes.
+
+The path of every phase point is fitted with the unknowns by Gauss-Newton (the iterated Kalman smoother of Bell 1994;
+weak-constraint variational assimilation). Linearised about that path, a Kalman filter gives the Gram matrix of the
+innovations as functions of the unknowns, from which step, evidence and scores of effects follow. As the force's
+intensity goes to zero this is the trajectory fit; it never diverges where that does.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._trajectory import Course, model_at
+
+
+class Linear(NamedTuple):
+    """The model linearised about a path: x' = defect + A dx + T dtheta, y = residual - H dx - G dtheta."""
+
+    defect: Float[Array, "time state"]
+    A: Float[Array, "time state state"]
+    T: Float[Array, "time state theta"]
+    residual: Float[Array, "time channel"]
+    H: Float[Array, "time channel state"]
+    G: Float[Array, "time channel theta"]
+
+
+class Pass(NamedTuple):
+    """A forward pass: the Gram matrix of the innovations by column [1, x_0, theta], and what a backward pass needs."""
+
+    gram: Float[Array, "column column"]
+    logs: Float[Array, ""]  # sum of log innovation variances
+    means: Float[Array, "time state column"]
+    covariances: Float[Array, "time state state"]
+    gains: Float[Array, "time channel state"]
+    innovations: Float[Array, "time channel column"]
+    variances: Float[Array, "time channel"]
+
+
+def linearise(equations, integrator, course: Course, path, calibrated, slots, onehot, readings) -> Linear:
+    """Linearise flow and observation about a path (time, state) at theta = [calibrated, slots]."""
+    theta = jnp.concatenate([calibrated, slots])
+    f = calibrated.shape[0]
+
+    def flow_and_read(x, theta, k):
+        flow, read = model_at(equations, integrator, course, theta[:f], theta[f:] @ onehot)
+        span = jax.tree.map(lambda leaf: leaf[k], course.spans)
+        return flow(x, span), read(x, (course.times[k], course.inputs[k]))
+
+    def row(x, k):
+        values = flow_and_read(x, theta, k)
+        slopes = jax.jacfwd(flow_and_read, argnums=(0, 1))(x, theta, k)
+        return values, slopes
+
+    n = path.shape[0]
+    (moved, h), ((A, T), (H, G)) = jax.vmap(row)(path, jnp.arange(n))
+    after = jnp.concatenate([path[1:], moved[-1:]])
+    seen = ~jnp.isnan(readings)
+    residual = jnp.where(seen, jnp.where(seen, readings, 0.0) - h, 0.0)
+    return Linear(moved - after, A, T, residual, H, G)
+
+
+def _diffusion(A: Array, intensity: Array, length: Array) -> Array:
+    """Covariance a white force adds over one span, by Simpson's rule over the time it acts. State (2d, 2d)."""
+    d = intensity.shape[0]
+    start = jnp.concatenate([jnp.zeros((d, d)), jnp.diag(jnp.sqrt(intensity))])
+    end, middle = A @ start, 0.5 * (start + A @ start)
+    return length / 6 * (end @ end.T + 4 * middle @ middle.T + start @ start.T)
+
+
+def forward(linear: Linear, variances: Array, intensity: Array, lengths: Array) -> Pass:
+    """Filter the columns [1, x_0, theta]; `variances` (time, channel) of the readings, 0 where there is none."""
+    state, theta = linear.A.shape[-1], linear.T.shape[-1]
+    size = 1 + state + theta
+    means = jnp.zeros((state, size)).at[:, 1 : 1 + state].set(jnp.eye(state))
+    zeros = jnp.zeros((linear.H.shape[1], state))
+
+    def step(carry, data):
+        M, P, gram, logs = carry
+        lin, r, length = data
+        M0, P0 = M, P
+        own = jnp.concatenate([lin.residual[:, None], jnp.zeros_like(zeros), -lin.G], axis=1)
+        gains, innovations, spread = [], [], []
+        for j in range(lin.H.shape[0]):  # channels are few, and independent given the state
+            h, seen = lin.H[j], r[j] > 0
+            S = jnp.where(seen, h @ P @ h + r[j], 1.0)
+            K = jnp.where(seen, P @ h / S, 0.0)
+            e = jnp.where(seen, own[j] - h @ M, 0.0)
+            gram, logs = gram + jnp.outer(e, e) / S, logs + jnp.where(seen, jnp.log(S), 0.0)
+            M, P = M + jnp.outer(K, e), P - jnp.outer(K, K) * S
+            gains, innovations, spread = [*gains, K], [*innovations, e], [*spread, S]
+        kept = (M0, P0, jnp.stack(gains), jnp.stack(innovations), jnp.stack(spread))
+        drift = jnp.concatenate([lin.defect[:, None], jnp.zeros((state, state)), lin.T], axis=1)
+        P = lin.A @ P @ lin.A.T + _diffusion(lin.A, intensity, length)
+        return (lin.A @ M + drift, 0.5 * (P + P.T), gram, logs), kept
+
+    start = (means, jnp.zeros((state, state)), jnp.zeros((size, size)), jnp.zeros(()))
+    (_, _, gram, logs), kept = jax.lax.scan(step, start, (linear, variances, lengths))
+    return Pass(gram, logs, *kept)
+
+
+class Smooth(NamedTuple):
+    """A backward pass: the path's correction, and what the readings say of noises."""
+
+    shift: Float[Array, "time state"]
+    noise: Float[Array, "time channel"]  # expected squared reading error, in the reading's own variance
+
+
+def backward(linear: Linear, done: Pass, variances: Array, delta: Array) -> Smooth:
+    """Smooth at a step `delta` of [x_0, theta] by Bryson and Frazier's recursion, which inverts nothing."""
+    column = jnp.concatenate([jnp.ones(1), delta])
+
+    def step(carry, data):
+        adjoint, information = carry
+        lin, M, P, K, e, S, r = data
+        own = []
+        for j in reversed(range(lin.H.shape[0])):
+            h, seen = lin.H[j], r[j] > 0
+            u = jnp.where(seen, e[j] @ column / S[j] - K[j] @ adjoint, 0.0)
+            D = jnp.where(seen, 1 / S[j] + K[j] @ information @ K[j], 0.0)
+            own = [r[j] ** 2 * u**2 + r[j] - r[j] ** 2 * D, *own]
+            keep = jnp.eye(h.shape[0]) - jnp.outer(K[j], h)
+            adjoint = jnp.where(seen, keep.T @ adjoint - h * (e[j] @ column) / S[j], adjoint)
+            information = jnp.where(seen, keep.T @ information @ keep + jnp.outer(h, h) / S[j], information)
+        shift = M @ column - P @ adjoint
+        return (adjoint, information), (shift, jnp.stack(own), adjoint)
+
+    def through(carry, data):
+        (adjoint, information), A, rest = carry, data[0], data[1:]
+        carry, (shift, own, _) = step((A.T @ adjoint, A.T @ information @ A), rest)
+        return carry, (shift, own)
+
+    d = linear.A.shape[-1]
+    # The span after a row carries its adjoint back; nothing follows the last row.
+    spans = linear.A.at[-1].set(0.0)
+    data = (spans, linear, done.means, done.covariances, done.gains, done.innovations, done.variances, variances)
+    _, (shift, own) = jax.lax.scan(through, (jnp.zeros(d), jnp.zeros((d, d))), data, reverse=True)
+    return Smooth(shift, own)
+
+
+@eqx.filter_jit
+def forward_lanes(equations, integrator, course, paths, calibrated, slots, onehots, readings, variances, intensities):
+    """Linearise and filter every lane over the leading rows that `paths` (lane, time, state) covers."""
+    lengths = course.spans.step * course.spans.inputs.shape[1]
+    n = paths.shape[1]
+
+    def lane(path, c, s, onehot, r, q):
+        linear = linearise(equations, integrator, course, path, c, s, onehot, readings)
+        return linear, forward(linear, r, q, lengths[:n])
+
+    return jax.vmap(lane)(paths, calibrated, slots, onehots, variances, intensities)
+
+
+backward_lanes = eqx.filter_jit(jax.vmap(backward))

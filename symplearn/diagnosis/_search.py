@@ -1,0 +1,199 @@
+"""The search: nothing left out, then single effects, pairs, triples; each fitted, then weighed under every remainder."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+
+import numpy as np
+
+from ._calibrate import Fits, Priors, grow
+from ._noisy import PathFit, fit_paths
+from ._problem import SLOTS, Combination, Problem
+from ._start import first_fits, priors_without_effects, scales, typical_forces, windows
+from ._stochastic import run_filter
+from ._trajectory import Stepper
+from ._weighed import Estimate, weigh_coloured, weigh_white
+
+# A window grows in these steps, so that a trajectory fit is not caught in a local minimum.
+_GROWTH = (0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.0)
+# Intensities of the missing force that are tried, as shares of the forces already there.
+_SHARES = np.geomspace(3e-5, 0.3, 8)
+# Combinations of one size are carried on to the next size while within this many nats of the best.
+_REACH = 30.0
+_KEPT = 8
+# Substeps over all rows beyond which the search is narrowed before the whole recording is used.
+_AFFORDABLE = 12_000
+
+
+@dataclass
+class Found:
+    """Everything that was weighed: estimates by combination, one per kind of remainder."""
+
+    priors: Priors
+    estimates: dict[Combination, list[Estimate]] = field(default_factory=dict)
+    complete: bool = True
+
+    def add(self, estimate: Estimate) -> None:
+        """Keep the better of two estimates of the same combination and kind."""
+        kinds = self.estimates.setdefault(estimate.combination, [])
+        kinds.append(estimate)
+
+    def best(self, combination: Combination) -> float:
+        """The largest log evidence of a combination over kinds."""
+        return max((e.log_evidence for e in self.estimates[combination]), default=-np.inf)
+
+
+class Search:
+    """Finds which combinations of effects explain the recordings of a problem, and with what evidence."""
+
+    def __init__(self, problem: Problem, jobs: int, deadline: float, progress: Callable[[str], None]):
+        self.problem, self.stepper = problem, Stepper(problem, jobs)
+        self.rows = [r.fitted for r in problem.rows]
+        self.deadline, self.progress = deadline, progress
+        self.fits: dict[Combination, Fits] = {}
+
+    def run(self) -> Found:
+        """Search, smallest combinations first."""
+        self.progress("calibrating the simulation")
+        bare = priors_without_effects(self.problem)
+        seeds = first_fits(self.stepper, bare, self.rows)
+        self.seed = seeds.z[0]
+        self.found = Found(bare)
+        self._add_null(bare, seeds.z)
+        self.progress("following the recording with a missing force")
+        self.null_paths = self._null_paths(bare)
+        best = max(self.null_paths, key=lambda fit: fit.laplace.log_evidence)
+        self.typical = typical_forces(self.problem, best.z, best.paths)
+        self.found.priors = replace(bare, scales=scales(self.problem, best.z, best.paths))
+        for size in range(1, SLOTS + 1):
+            candidates = self._proposals(size)
+            if not candidates or not self._in_time():
+                break
+            self.progress(f"weighing {len(candidates)} combinations of {size} effect{'s' * (size > 1)}")
+            self._weigh(candidates)
+            if size > 1 and not self._gained(size):
+                break
+        self.progress("weighing missing forces beside the best combinations")
+        self._weigh_forces()
+        return self.found
+
+    def _in_time(self) -> bool:
+        if time.monotonic() > self.deadline:
+            self.found.complete = False
+        return self.found.complete
+
+    def _add_null(self, priors: Priors, starts: np.ndarray) -> None:
+        fits = grow(self.stepper, starts[:8], [()] * len(starts[:8]), priors, self._windows())
+        white = weigh_white(self.problem, fits, priors, self.rows)
+        best = int(np.argmax([e.log_evidence for e in white]))
+        self.found.add(white[best])
+        self.found.add(weigh_coloured(self.problem, fits, priors, self.rows)[best])
+
+    def _windows(self) -> list[list[int]]:
+        return windows(self.rows, _GROWTH, max(8, 4 * self.problem.state))
+
+    def _null_paths(self, priors: Priors) -> list[PathFit]:
+        """The simulation without effects under missing forces of several intensities."""
+        problem = self.problem
+        white = self.found.estimates[()][0]
+        starts = []
+        guess = self._rough_noise()
+        first = [self._filtered_path(r, self.seed, guess) for r in range(len(self.rows))]
+        self.typical = typical_forces(problem, self.seed, first)
+        for share in _SHARES:
+            start = PathFit((), self._intensity(share), self.seed, guess, first)
+            starts.append(start)
+        fits = fit_paths(self.stepper, starts, priors, self.rows)
+        trajectory = PathFit((), self._intensity(_SHARES[0]), white.z, white.noise, first)
+        del trajectory
+        self._add_paths(fits)
+        return fits
+
+    def _intensity(self, share: float) -> np.ndarray:
+        """Squared force times the time over which it would be felt: a tenth of the shortest recording's length."""
+        length = min(r.times[n - 1] - r.times[0] for r, n in zip(self.problem.rows, self.rows, strict=True))
+        return (share * np.maximum(self.typical, 1e-300)) ** 2 * length / 10
+
+    def _rough_noise(self) -> np.ndarray:
+        """Reading noise from third differences, which a smooth motion hardly has."""
+        out = []
+        for j, known in enumerate(self.problem.noise):
+            squares = [np.diff(r.readings[:n, j], 3) ** 2 / 20 for r, n in zip(self.problem.rows, self.rows, strict=True)]
+            joined = np.concatenate(squares)
+            spread = np.nanstd(np.concatenate([r.readings[:n, j] for r, n in zip(self.problem.rows, self.rows, strict=True)]))
+            rough = np.sqrt(np.nanmedian(joined) / 0.455) if np.isfinite(joined).any() else spread
+            count = max(1.0, float(np.median(self.problem.rows[0].counts[:, j])))
+            out.append(known if np.isfinite(known) else max(rough, 1e-6 * spread) * np.sqrt(count))
+        return np.array(out)
+
+    def _filtered_path(self, r: int, z: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """A path near the readings: filtered with a strong missing force, from a wide initial state."""
+        problem, course = self.problem, self.stepper.courses[r]
+        x = z[r * problem.state : (r + 1) * problem.state]
+        spread = np.diag(np.maximum(0.05 * np.abs(x), 1e-3 * np.abs(x).max() + 1e-12) ** 2)
+        spread[problem.initial.sd == 0] = 0.0
+        force = typical_forces(problem, z, [np.tile(x, (1, 1))] * len(self.rows))
+        span = float(np.median(np.diff(problem.rows[r].times)))
+        intensity = np.maximum(force, np.abs(force).max() * 1e-3) ** 2 * span * 10
+        _, filtered = run_filter(problem, course, r, z, (), noise, intensity, spread, self.rows[r])
+        means = np.array(filtered.filtered_means)
+        means[0] = x
+        return means if bool(filtered.ok) else np.tile(x, (self.rows[r], 1))
+
+    def _proposals(self, size: int) -> list[Combination]:
+        """Combinations of one size: every single effect, then what extends the best of the size below."""
+        searched = self.problem.searched
+        if size == 1:
+            return [(c,) for c in searched]
+        if size == 2 and len(searched) <= 12:
+            return list(combinations(searched, 2))
+        known = [c for c in self.found.estimates if len(c) == size - 1]
+        top = max((self.found.best(c) for c in known), default=-np.inf)
+        ranked = sorted(known, key=self.found.best, reverse=True)
+        kept = [c for c in ranked if self.found.best(c) > top - _REACH][:_KEPT] or ranked[:_KEPT]
+        if size == 2:
+            kept = ranked[:_KEPT]
+        more = {tuple(sorted((*c, one))) for c in kept for one in searched if one not in c}
+        return sorted(more)
+
+    def _gained(self, size: int) -> bool:
+        """Whether the best of this size beats the best of smaller ones, so that a larger one may be worth it."""
+        smaller = max(self.found.best(c) for c in self.found.estimates if len(c) < size)
+        return max(self.found.best(c) for c in self.found.estimates if len(c) == size) > smaller
+
+    def _weigh(self, candidates: Sequence[Combination]) -> None:
+        priors = self.found.priors
+        start = np.tile(self.seed, (len(candidates), 1))
+        start[:, self.problem.head + self.problem.calibrated.size :] = 0.0
+        fits = grow(self.stepper, start, candidates, priors, self._windows())
+        for estimate in weigh_white(self.problem, fits, priors, self.rows):
+            self.found.add(estimate)
+        for estimate in weigh_coloured(self.problem, fits, priors, self.rows):
+            self.found.add(estimate)
+
+    def _weigh_forces(self) -> None:
+        """Best combinations again, each with a missing force beside it."""
+        named = [c for c in self.found.estimates if c]
+        contenders = sorted(named, key=self.found.best, reverse=True)[:_KEPT]
+        null = max(self.null_paths, key=lambda fit: fit.laplace.log_evidence)
+        starts = []
+        for c in contenders:
+            white = self.found.estimates[c][0]
+            for share in _SHARES[:-1]:
+                starts.append(PathFit(c, self._intensity(share), white.z, null.noise, null.paths))
+        self._add_paths(fit_paths(self.stepper, starts, self.found.priors, self.rows))
+
+    def _add_paths(self, fits: Sequence[PathFit]) -> None:
+        """Of the intensities tried for each combination, the best, owing for the choice."""
+        for combination in dict.fromkeys(fit.combination for fit in fits):
+            mine = [fit for fit in fits if fit.combination == combination]
+            values = np.array([fit.laplace.log_evidence for fit in mine])
+            if not np.isfinite(values).any():
+                continue
+            best = mine[int(np.argmax(values))]
+            mean = values.max() + np.log(np.mean(np.exp(values - values.max())))
+            self.found.add(
+                Estimate(combination, "force", best.z, best.laplace.covariance, best.noise, float(mean),
+                         best.converged, intensity=best.intensity, paths=best.paths)  # fmt: skip
+            )

@@ -1,0 +1,109 @@
+"""Where the fits begin: initial states found in a short window, substeps fine enough, scales of every effect."""
+
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from .._effects import Drag, PowerForce
+from ._calibrate import Fits, Priors, calibrate, grow
+from ._problem import Problem
+from ._trajectory import Stepper
+
+# Starts tried for the initial states, and the spread of the random ones.
+_STARTS = 16
+_SPREADS = (0.1, 1.0, 1.0, 10.0)
+# Prior scale of an effect: its force against the forces already there, or its error against the reading's spread.
+STRENGTH = 0.3
+
+
+def priors_without_effects(problem: Problem) -> Priors:
+    """Priors of calibrated values and initial states; effects are held at zero by an infinite precision nowhere used."""
+    c, size = problem.calibrated, problem.size
+    mean, precision = np.zeros(size), np.zeros(size)
+    mean[: problem.head] = np.tile(problem.initial.mean, len(problem.rows))
+    with np.errstate(divide="ignore"):
+        inverse = np.where(problem.initial.sd > 0, problem.initial.sd, np.inf) ** -2.0
+        precision[: problem.head] = np.tile(inverse, len(problem.rows))
+        part = slice(problem.head, problem.head + c.size)
+        mean[part], precision[part] = c.mean, c.sd**-2.0
+    return Priors(mean, precision, np.full(len(problem.equations.candidates), np.inf))
+
+
+def windows(rows: Sequence[int], fractions: Sequence[float], least: int) -> list[list[int]]:
+    """Numbers of rows of every recording for growing windows."""
+    return [[max(min(least, n), round(n * fraction)) for n in rows] for fraction in fractions]
+
+
+def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
+    """Calibrate initial states, then everything, in short windows from many starts; the best lane comes first."""
+    problem = stepper.problem
+    short = windows(rows, (0.02, 0.04, 0.08), max(8, 4 * problem.state))
+    rng = np.random.default_rng(0)
+    z = np.tile(priors.mean, (_STARTS, 1))
+    spread = np.resize(np.repeat(_SPREADS, _STARTS // len(_SPREADS)), _STARTS)
+    noise = rng.normal(size=(_STARTS, problem.head)) * spread[:, None]
+    given = np.tile(np.where(np.isfinite(problem.initial.sd), problem.initial.sd, 0.0), len(problem.rows))
+    unknown = np.tile(np.isinf(problem.initial.sd), len(problem.rows))
+    z[:, : problem.head] += np.where(unknown, noise, given * noise / spread[:, None])
+    tight = _tightened(problem, priors)
+    fits = calibrate(stepper, z, [()] * _STARTS, tight, short[0], 40)
+    fits = grow(stepper, fits.z, fits.combinations, priors, short[1:])
+    order = np.argsort(np.where(np.isfinite(fits.cost), _likelihood(problem, fits, short[-1]), np.inf))
+    return Fits([()] * _STARTS, fits.z[order], fits.noise[order], [], fits.cost[order], fits.converged[order])
+
+
+def _tightened(problem: Problem, priors: Priors) -> Priors:
+    """Calibrated values held near their starting values while the initial states are found."""
+    precision = priors.precision.copy()
+    part = slice(problem.head, problem.head + problem.calibrated.size)
+    scale = 1e-3 * np.maximum(np.abs(problem.calibrated.mean), 1e-6)
+    precision[part] = np.maximum(precision[part], scale**-2.0)
+    return Priors(priors.mean, precision, priors.scales)
+
+
+def _likelihood(problem: Problem, fits: Fits, rows: Sequence[int]) -> np.ndarray:
+    """Minus twice the profile likelihood: with an estimated noise the cost alone tells nothing."""
+    number = sum((r.counts[:n] > 0).sum(0) for r, n in zip(problem.rows, rows, strict=True))
+    return fits.cost + 2 * (number * np.log(fits.noise)).sum(1)
+
+
+def scales(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarray, "time state"]]) -> np.ndarray:
+    """Prior standard deviation of every coefficient: the same strength for every effect, along given paths."""
+    eq, d = problem.equations, problem.equations.dim
+    velocity, force, readings = (_along(problem, z, paths, f) for f in (eq.velocity, eq.slope, eq.readings))
+    q = np.concatenate([path[:, :d] for path in paths])
+    out = np.empty(len(eq.candidates))
+    for place, one in enumerate(eq.candidates):
+        i = one.place
+        if one.effect.family == "sensor":
+            spread = np.std(readings[:, i])
+            out[place] = STRENGTH * (spread if one.effect.name == "sensor_bias" else 1.0)
+            continue
+        power = one.effect.power if isinstance(one.effect, PowerForce | Drag) else 0
+        unit = np.abs(velocity[:, i] if isinstance(one.effect, Drag) else q[:, i]) ** power
+        out[place] = STRENGTH * _rms(force[:, i]) / max(_rms(unit), 1e-300)
+    return np.where(np.isfinite(out) & (out > 0), out, 1.0)
+
+
+def typical_forces(problem: Problem, z: np.ndarray, paths: Sequence[np.ndarray]) -> np.ndarray:
+    """Root mean square of dp/dt along given paths, by momentum."""
+    force = _along(problem, z, paths, problem.equations.slope)
+    return np.sqrt((force**2).mean(0))
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _along(problem: Problem, z: np.ndarray, paths: Sequence[np.ndarray], function) -> np.ndarray:
+    """One of the compiled equations along the paths of all recordings, without effects."""
+    rows = []
+    for r, path in enumerate(paths):
+        n = len(path)
+        fixed = np.broadcast_to(problem.parameter_values(z), (n, len(problem.parameters)))
+        terms = np.broadcast_to(problem.coefficients(r, z, ()), (n, problem.terms.shape[1]))
+        parts = [path, fixed, problem.rows[r].inputs[:n], problem.rows[r].times[:n, None], terms]
+        rows.append(np.asarray(jax.vmap(function)(np.concatenate(parts, axis=1))))
+    return np.concatenate(rows)

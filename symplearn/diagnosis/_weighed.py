@@ -1,0 +1,134 @@
+"""One combination of effects with its evidence under each kind of remainder."""
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from ._calibrate import Fits, Priors, normal_equations, residuals, weights
+from ._coloured import Colour, fit_colour, whitened_gram
+from ._evidence import Laplace, laplace, variance_inflation
+from ._problem import Combination, Problem
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A combination fitted under one kind of remainder.
+
+    `kind` is `white` (no remainder), `coloured` (an error of the sensor with a memory) or `force` (a white missing
+    force of `intensity`). `noise` is the white sd of one original reading.
+    """
+
+    combination: Combination
+    kind: str
+    z: Float[np.ndarray, " z"]
+    covariance: Float[np.ndarray, "z z"]
+    noise: Float[np.ndarray, " channel"]
+    log_evidence: float
+    converged: bool
+    inflation: float = 1.0
+    intensity: Float[np.ndarray, " d"] | None = None
+    paths: list[np.ndarray] | None = field(default=None, repr=False)
+
+
+class Kind(Protocol):
+    """A kind of remainder that turns fitted lanes into estimates."""
+
+    def __call__(self, problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -> list[Estimate]: ...
+
+
+def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -> list[Estimate]:
+    """Estimates under white reading noise alone."""
+    weight = weights(problem, rows)
+    matrix, vector = normal_equations(problem, fits, weight)
+    r = residuals(problem, fits.predictions, weight)
+    square = sum((w * (x / fits.noise[:, None]) ** 2).sum((1, 2)) for w, x in zip(weight, r, strict=True))
+    offset = _constant(weight, fits.noise)
+    out = []
+    for b, combination in enumerate(fits.combinations):
+        gram = np.block([[np.full((1, 1), square[b]), vector[b][None]], [vector[b][:, None], matrix[b]]])
+        one = _laplace(problem, combination, gram, offset[b], fits.z[b], priors)
+        scores = _scores(problem, fits, b, r, weight)
+        out.append(
+            Estimate(combination, "white", fits.z[b], one.covariance, fits.noise[b], one.log_evidence,
+                     bool(fits.converged[b]), variance_inflation(scores))  # fmt: skip
+        )
+    return out
+
+
+def weigh_coloured(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -> list[Estimate]:
+    """Estimates where each channel's error has a memory: generalised least squares about the trajectory fit."""
+    weight, lanes = weights(problem, rows), len(fits.z)
+    r = residuals(problem, fits.predictions, weight)
+    times = [rows_.times[:n] for rows_, n in zip(problem.rows, rows, strict=True)]
+    size = 1 + problem.size
+    grams, logs = np.zeros((lanes, problem.channels, size, size)), np.zeros((lanes, problem.channels))
+    occam = np.zeros(lanes)
+    for j in range(problem.channels):
+        known = None if np.isnan(problem.noise[j]) else float(problem.noise[j])
+        colours = fit_colour([x[..., j] for x in r], [w[:, j] for w in weight], times, known)
+        occam += [colour.occam for colour in colours]
+        for k in range(len(times)):
+            gram, log = _channel_gram(problem, fits, r[k][..., j], weight[k][:, j], times[k], colours, k, j)
+            grams[:, j] += gram
+            logs[:, j] += log
+    number = sum((w > 0).sum(0) for w in weight)
+    return [
+        _coloured_estimate(problem, fits, b, grams[b], logs[b], number, occam[b], priors) for b in range(lanes)
+    ]
+
+
+def _channel_gram(problem, fits: Fits, residual, weight, times, colours: list[Colour], recording: int, channel: int):
+    place = np.concatenate([[0], 1 + problem.local(recording)])
+    slopes = np.where(weight > 0, fits.predictions[recording].slopes[..., channel], 0.0)
+    columns = np.concatenate([residual[:, None], slopes], axis=1)
+    gram, log = whitened_gram(columns, weight, times, colours)
+    full = np.zeros((len(columns), 1 + problem.size, 1 + problem.size))
+    full[:, place[:, None], place[None, :]] = gram
+    return full, log
+
+
+def _coloured_estimate(problem, fits: Fits, b: int, grams, logs, number, occam: float, priors: Priors) -> Estimate:
+    """Integrate the unknowns with each channel's white noise at its best value, found by alternation."""
+    combination, noise = fits.combinations[b], fits.noise[b].copy()
+    free = np.isnan(problem.noise)
+    for _ in range(6):
+        gram = (grams / (noise**2)[:, None, None]).sum(0)
+        offset = -0.5 * float((number * np.log(2 * np.pi * noise**2) + logs).sum())
+        one = _laplace(problem, combination, gram, offset, fits.z[b], priors)
+        column = np.concatenate([[1.0], -one.step])
+        square = np.einsum("i,jik,k->j", column, grams, column)
+        noise = np.where(free, np.sqrt(np.maximum(square, 1e-300) / np.maximum(number, 1)), noise)
+    z = fits.z[b] + one.step
+    return Estimate(combination, "coloured", z, one.covariance, noise, one.log_evidence + occam,
+                    bool(fits.converged[b]))  # fmt: skip
+
+
+def _laplace(problem: Problem, combination: Combination, gram, offset: float, z, priors: Priors) -> Laplace:
+    if not np.isfinite(gram).all():
+        return Laplace(-np.inf, np.zeros(problem.size), np.zeros((problem.size, problem.size)))
+    precision = priors.precision_of(problem, combination)
+    active, lower = problem.active(combination), problem.lower_bounds(combination)
+    return laplace(gram, offset, z, priors.mean, precision, active, lower)
+
+
+def _constant(weight: list[np.ndarray], noise: np.ndarray) -> np.ndarray:
+    """Log normalisation of the readings by lane."""
+    number = sum((w > 0).sum(0) for w in weight)
+    return -0.5 * (number * np.log(2 * np.pi * noise**2)).sum(1) + 0.5 * information(weight)
+
+
+def information(weight: list[np.ndarray]) -> float:
+    """Sum of the log weights of the rows, which every kind of remainder owes for readings that are averages."""
+    return float(sum(np.log(w[w > 0]).sum() for w in weight))
+
+
+def _scores(problem: Problem, fits: Fits, b: int, r, weight) -> np.ndarray:
+    """Score of every row and every shared unknown; recordings end to end."""
+    parts = []
+    shared = slice(problem.state, None)
+    for p, x, w in zip(fits.predictions, r, weight, strict=True):
+        scaled = np.where(w > 0, p.slopes[b, shared], 0.0) * (w * x[b] / fits.noise[b] ** 2)
+        parts.append(scaled.sum(-1).T)
+    return np.concatenate(parts)

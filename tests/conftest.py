@@ -1,0 +1,29 @@
+"""Double precision, and a private folder where compiled programs outlive the run."""
+
+import os
+from pathlib import Path
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+
+def _private_cache() -> Path | None:
+    """A folder of ours alone, mode 0700: what lies in it is executed. None where there can be none."""
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = root / "symplearn" / "jax"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if folder.is_symlink() or folder.stat().st_uid != os.getuid():
+            return None
+        folder.chmod(0o700)
+    except OSError:
+        return None
+    return folder
+
+
+# JAX reads $JAX_COMPILATION_CACHE_DIR by itself.
+if not os.environ.get("JAX_COMPILATION_CACHE_DIR") and (_cache := _private_cache()) is not None:
+    jax.config.update("jax_compilation_cache_dir", str(_cache))
+# By default only programs of more than a second are kept; ours are many and small.
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
