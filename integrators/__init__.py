@@ -12,6 +12,7 @@ from integrators._system import AbstractSeparableHamiltonian as AbstractSeparabl
 from integrators._system import AbstractForce as AbstractForce
 from integrators._system import Forced as Forced
 from integrators._system import System as System
+from integrators._system import Time as Time
 from integrators._system import as_parameter as as_parameter
 from integrators._system import split as split
 from integrators._forces import ViscousDamping as ViscousDamping

@@ -215,7 +215,7 @@ class _Reader:
     def refusal(self, cell: str, column: str, line: int) -> InputError:
         """What is wrong with a cell that is no finite number."""
         text = cell.strip()
-        advice = "leave the cell empty where a reading is missing"
+        advice = "give a number (a missing reading is an empty cell)"
         if (
             text.lower().lstrip("+-") in ("inf", "infinity")
             or frozenset(text) <= _NUMERIC

@@ -136,10 +136,14 @@ def _descend(model, series, objective, prior, scale, max_steps):
     return rebuild(solution.value), inverse, solution.stats["num_steps"]
 
 
+def gradient(score: Callable[[Array], Array], size: int) -> Callable[[Array], Array]:
+    """The gradient of a score of `size` parameters: forward for a few, reverse for many."""
+    return jax.jacfwd(score) if size <= _FORWARD else jax.grad(score)
+
+
 def guarded(score: Callable[[Array], Array], size: int) -> Callable[[Array], Array]:
     """`score` with a large finite number for every non-finite one, and with derivatives that are never
     NaN."""
-    derivative = jax.jacfwd if size <= _FORWARD else jax.grad
 
     @jax.custom_jvp
     def safe(free):
@@ -148,8 +152,7 @@ def guarded(score: Callable[[Array], Array], size: int) -> Callable[[Array], Arr
 
     @safe.defjvp
     def _(primals, tangents):
-        gradient = derivative(score)(primals[0])
-        gradient = jnp.where(jnp.isfinite(gradient), gradient, 0.0)
-        return safe(primals[0]), gradient @ tangents[0]
+        slope = gradient(score, size)(primals[0])
+        return safe(primals[0]), jnp.where(jnp.isfinite(slope), slope, 0.0) @ tangents[0]
 
     return safe

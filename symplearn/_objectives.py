@@ -71,8 +71,13 @@ class MarginalLikelihood(AbstractObjective):
 
     def filter(self, model: StateSpaceModel, recording: Any) -> Filtered:
         """The filter's history behind the score."""
-        model, readings, intervals = prepare(model, as_time_series(recording))
-        return unscented_filter(model, readings, intervals, transform=self.transform)
+        return _filter(model, as_time_series(recording), self.transform)
+
+
+@eqx.filter_jit
+def _filter(model: StateSpaceModel, series: TimeSeries, transform: UnscentedTransform) -> Filtered:
+    model, readings, intervals = prepare(model, series)
+    return unscented_filter(model, readings, intervals, transform=transform)
 
 
 MARGINAL_LIKELIHOOD = MarginalLikelihood()

@@ -85,7 +85,7 @@ def _one(recording: HasRows, rows: Thinned, first: int, pieces: int, holdout: fl
         times=times,
         readings=readings,
         counts=counts,
-        spans=_spans(times, pieces, recording.inputs),
+        spans=spans_between(times, pieces, recording.inputs),
         inputs=_at(recording.inputs, times),
         fitted=int(places[first - 1]) + 1,
         given=len(recording.times),
@@ -107,7 +107,8 @@ def _bridged(times: np.ndarray, usual: float) -> tuple[Int[np.ndarray, " row"], 
     return places, np.interp(np.arange(places[-1] + 1), places, times)
 
 
-def _spans(times: np.ndarray, pieces: int, inputs: Any) -> Span:
+def spans_between(times: Float[np.ndarray, " time"], pieces: int, inputs: Any) -> Span:
+    """Spans of `pieces` substeps between consecutive times. `InputError` where inputs are not known that far."""
     step = np.diff(times) / pieces
     edges = times[:-1, None] + step[:, None] * np.arange(pieces + 1)
     if inputs is None:

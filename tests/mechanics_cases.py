@@ -23,7 +23,7 @@ METHODS: dict[str, ig.AbstractIntegrator] = {
 
 
 class Case(NamedTuple):
-    """A problem, its equations by hand, the signs of its reversal of motion, and a time with structure in it."""
+    """A problem, its equations by hand, the signs of its reversal of motion, and a time to follow it for."""
 
     system: ig.AbstractHamiltonian
     equations: Callable[[float, np.ndarray], list[float]]

@@ -3,6 +3,7 @@
 import gzip
 import os
 import random
+import re
 import time
 
 import pytest
@@ -65,7 +66,7 @@ TOML = {
     "unknown recording key": changed('time = "t_s"', 'time = "t_s"\nstrat = 1'),
     "unknown prior key": changed("sd = 0.01", "std = 0.01"),
     "unknown integrator key": changed("step = 0.01", "stepp = 0.01"),
-    "no system": changed("[system]", "[units]").replace("coordinates = [", "a = [").replace("momenta = [", "b = ["),
+    "no system": GOOD[: GOOD.index("[system]")] + GOOD[GOOD.index("[parameters]") :],
     "no recording": GOOD.split("[recording]")[0],
     "no momenta": changed('momenta = ["p_theta"]\n', ""),
     "no hamiltonian": changed('hamiltonian = "p_theta**2/(2*m*l**2) - m*g*l*cos(theta)"\n', ""),
@@ -189,7 +190,7 @@ def test_wrong_simulation_files(text, tmp_path):
         ("unknown prior key", r"\[parameters\] l.std: unknown key; did you mean `sd`"),
         ("unknown section", r"sytem: unknown key; did you mean `system`"),
         ("coordinate without momentum", r"\[system\]: 2 coordinates but 1 momenta"),
-        ("undeclared", r"\[system\] hamiltonian: undeclared name `gg` at character 25"),
+        ("undeclared", r"\[system\] hamiltonian: undeclared name `gg` at character 27"),
         (
             "parameter truth value",
             r"\[parameters\] m: the truth value true was given where a number is needed",
@@ -237,11 +238,10 @@ CSV = {
     "no column": ("\n".join(ROWS).replace("angle", "angel"), "did you mean `angel`"),
     "no time column": ("\n".join(ROWS).replace("t_s", "time"), "no column `t_s`"),
     "no input column": ("\n".join(ROWS).replace("u,", "v,"), "no column `u`"),
-    "column twice": ("\n".join(ROWS).replace("t_s,u,angle", "angle,u,angle").replace("angle,", "t_s,angle,", 1), "angle"),
     "doubled header": ("t_s,u,angle,angle\n" + "\n".join(f"{r},1" for r in ROWS[1:]), "two columns"),
     "text in a number column": (row(5, "0.4,0.5,abc"), r"line 6, column `angle`: `abc` is not a number"),
     "text in time": (row(5, "x,0.5,0.3"), r"line 6, column `t_s`"),
-    "NA": (row(5, "0.4,0.5,NA"), "`NA` is not a number; leave the cell empty"),
+    "NA": (row(5, "0.4,0.5,NA"), "`NA` is not a number; give a number .a missing reading is an empty cell"),
     "null": (row(5, "0.4,0.5,null"), "null"),
     "None": (row(5, "0.4,0.5,None"), "None"),
     "dash": (row(5, "0.4,0.5,-"), "`-` is not a number"),
@@ -284,8 +284,7 @@ def test_wrong_recordings(text, reason, tmp_path):
     path.write_text(text, newline="")
     simulation = parse_simulation(GOOD, "pendulum.toml")
     sentence = refused(lambda: read_recordings(simulation, [path]), "swing.csv")
-    with pytest.raises(InputError, match=reason):
-        raise InputError(sentence)
+    assert re.search(reason, sentence)
 
 
 def test_paths_that_are_no_recording(tmp_path):

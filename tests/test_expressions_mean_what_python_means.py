@@ -103,7 +103,7 @@ def value(expr, **changed):
 @pytest.mark.parametrize("text", TEXTS)
 def test_value_is_pythons(text):
     """An expression has the value that Python gives to the same text."""
-    expected = eval(text.strip(), {"__builtins__": {}}, ORACLE)  # noqa: S307
+    expected = eval(" ".join(text.split()), {"__builtins__": {}}, ORACLE)  # noqa: S307
     # 1e-13: a few roundings, of terms up to a hundred times the result.
     assert value(parse_expression(text, NAMES, where=WHERE)) == pytest.approx(expected, rel=1e-13, abs=1e-13)
 
@@ -117,9 +117,8 @@ def test_derivative_is_the_finite_difference(text, name):
     measured = (value(expr, **{name: POINT[name] + h}) - value(expr, **{name: POINT[name] - h})) / (2 * h)
     slope = derivative(expr, symbol(name))
     assert not slope.has(sympy.Derivative, sympy.DiracDelta, sympy.Subs)
-    # A central difference errs by h^2 f'''/6 (1e-10 times slopes up to 100) and by rounding, 1e-16 / h times values.
-    scale = 1 + abs(value(expr))
-    assert value(slope) == pytest.approx(measured, rel=1e-6, abs=1e-8 * min(scale, 1e20))
+    # A central difference errs by h^2 f'''/6, 1e-10 times slopes up to 100, and by rounding, 1e-16 f/h.
+    assert value(slope) == pytest.approx(measured, rel=1e-6, abs=1e-8 * (1 + abs(value(expr))))
 
 
 def test_squares_keep_exact_exponents():
@@ -249,7 +248,7 @@ MONSTERS = [
     "x/" * 4999 + "y",
     "*".join(f"(x+{i}*sin(y*{i}))" for i in range(500)),
     "(" * 99 + "x" + "/y)**x" * 99,
-    "(" * 99 + "1/(x" + "+y))" * 99,
+    "1/(x+" * 99 + "y" + ")" * 99,
     "*".join(f"{i}/{i + 1}*x" for i in range(9000, 9600)),
     "(" + "+".join(f"x/{i}" for i in range(2, 1200)) + ")**9999",
     "0**x**0",
@@ -259,7 +258,7 @@ MONSTERS = [
 
 @pytest.mark.parametrize("text", MONSTERS, ids=range(len(MONSTERS)))
 def test_work_is_bounded_by_the_length(text):
-    """Within the limits of length and depth every text is parsed or refused in seconds, without huge numbers."""
+    """Every text within the limits is parsed or refused in seconds, without huge numbers."""
     begin = time.perf_counter()
     try:
         expr = parse_expression(text, NAMES, where=WHERE)

@@ -24,7 +24,7 @@ def damped_oscillator(t, mass=2.0, stiffness=3.0, c=0.4):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_viscous_damping_converges_to_the_closed_form_at_order_two(name):
-    """With a force every method, of whatever order without, converges at order 2 to the damped oscillation."""
+    """With a force every method, whatever its own order, converges at order 2 to the damped oscillation."""
     system = ig.Forced(OSCILLATOR, [ig.ViscousDamping(0.4)])
     end = jnp.asarray(damped_oscillator(5.0))
     slope = ig.observed_order(system, METHODS[name], START, 5.0, steps=(200, 400, 800), reference=end)
@@ -41,7 +41,7 @@ def test_without_forces_it_is_the_method_itself(name):
 
 @pytest.mark.parametrize("force", [ig.ViscousDamping(0.4), ig.QuadraticDrag(0.4), ig.CoulombFriction(0.1)])
 def test_dissipation_never_raises_the_energy(force):
-    """Each dissipative kick lowers the energy; the implicit midpoint flow between keeps a quadratic one exactly."""
+    """Dissipative kicks lower the energy; the implicit midpoint flow keeps a quadratic one exactly."""
     path = ig.integrate(
         ig.Forced(OSCILLATOR, [force]), ig.ImplicitMidpoint(), START, np.linspace(0.0, 30.0, 601)
     )
@@ -67,7 +67,7 @@ def test_coulomb_friction_takes_a_fixed_amount_off_each_swing(name):
     turns = np.pi * np.arange(6)
     path = ig.integrate(system, METHODS[name], jnp.array([1.03, 0.0]), turns, substeps=2000)
     expected = (-1.0) ** np.arange(6) * (1.03 - 0.2 * np.arange(6))
-    # Each turn falls within a step, dt = 1.6e-3, of a grid point: an error in the friction impulse of order f dt.
+    # The sign of v changes within a step of 1.6e-3: a friction impulse wrong by f dt at each turn.
     np.testing.assert_allclose(path.qs[:, 0], expected, atol=5e-4)
 
 
@@ -92,17 +92,19 @@ def test_a_push_beyond_the_limit_sets_it_free():
 
 
 def test_friction_s_gradient_exists_where_friction_is_absent():
-    """d q(T) / df at f = 0 equals the finite difference, so that a search can start without friction."""
+    """At f = 0, from rest, q(T) has the right derivatives in f and p: a search can start without friction."""
 
-    def end(f):
+    @jax.jit
+    def end(f, p):
         system = ig.Forced(OSCILLATOR, [ig.CoulombFriction(f)])
-        return ig.propagate(system, ig.Leapfrog(), START, 0.0, 3.0, 300)[0]
+        return ig.propagate(system, ig.Leapfrog(), jnp.stack([1.0, p]), 0.0, 3.0, 300)[0]
 
     h = 1e-6
-    difference = (end(h) - end(0.0)) / h
-    assert jax.jit(jax.grad(end))(0.0) == pytest.approx(
-        float(difference), abs=1e-5
-    )  # one-sided: error of order h
+    in_friction, in_momentum = jax.grad(end, argnums=(0, 1))(0.0, 0.0)
+    # One-sided in f, where the error is of order h; in p dq/dp = sin(w T) / (m w), to order 2 at dt = 0.01.
+    assert in_friction == pytest.approx(float((end(h, 0.0) - end(0.0, 0.0)) / h), abs=1e-5)
+    omega = np.sqrt(1.5)
+    assert in_momentum == pytest.approx(np.sin(3.0 * omega) / (2.0 * omega), abs=1e-4)
 
 
 def test_forces_on_two_coordinates_and_together():

@@ -1,4 +1,4 @@
-"""`integrate` compiles once per structure, differentiates both ways, says when it fails, and refuses what it cannot do."""
+"""`integrate` compiles once per structure, differentiates both ways, says when it fails."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ TRACES = []
 
 
 class Counted(ig.AbstractSeparableHamiltonian):
-    """An oscillator that notes each trace of its potential; its field has no converter, as a user may write it."""
+    """An oscillator that notes each trace of its potential. Its field has no converter: users forget it."""
 
     stiffness: Float[Array, ""]
 
@@ -28,7 +28,7 @@ class Counted(ig.AbstractSeparableHamiltonian):
 
 @pytest.mark.parametrize("name", ["leapfrog", "tao", "rk4"])
 def test_a_new_parameter_value_compiles_nothing(name):
-    """Another value, as a float or a weakly typed array, another start and other times all reuse one compilation."""
+    """Another value, float or weakly typed, another start and other times all reuse one compilation."""
     ig.integrate(Counted(2.0), METHODS[name], jnp.array([1.0, 0.0]), TS, substeps=3)
     before = len(TRACES)
     assert before > 0
@@ -47,9 +47,9 @@ def test_substeps_are_not_unrolled():
     assert counts[0] == counts[1] > 0
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", ["leapfrog", "suzuki4", "tao", "heun", "rk4", "implicit-midpoint"])
 def test_forward_and_reverse_derivatives_agree_with_finite_differences(name):
-    """The end point's derivatives in a parameter and in the start, forward and reverse, match central differences."""
+    """The end point's derivatives, forward and reverse, match central differences."""
     method, x = METHODS[name], jnp.array([1.0, 0.3])
 
     def end(theta):
@@ -84,7 +84,7 @@ def test_irregular_times_run_through_the_same_points():
 
 
 def test_the_zoo_starts_where_the_literature_does():
-    """Each initial phase point has its published energy, and Kepler's and Tao's orbits close after their periods."""
+    """Each initial phase point has its published energy; Kepler's and Tao's orbits close after a period."""
     published = {"henon-heiles": 0.122708, "cherry": -0.00775, "tao-example": 5.0, "kepler": -0.5}
     for name, energy in published.items():
         system = CASES[name].system
@@ -148,7 +148,7 @@ def test_bad_arguments_get_one_clear_sentence(x0, ts, substeps, message):
 
 
 def test_bad_methods_are_refused_at_construction():
-    """A node outside the step, weights that are no composition, and a base that is not symmetric are refused."""
+    """A node outside the step, weights that do not sum to one, and a base not symmetric are refused."""
     with pytest.raises(ValueError, match=r"node in \(0, 1\], but was given 0"):
         ig.RK2(0.0)
     with pytest.raises(ValueError, match="palindromic weights that sum to one"):

@@ -40,8 +40,8 @@ def test_observed_order_without_a_reference_uses_a_finer_run():
     assert slope == pytest.approx(2.0, abs=0.03)
 
 
-def test_suzuki_errs_far_less_than_yoshida_at_the_same_cost():
-    """At equal evaluations of the force, Suzuki's composition is several times more accurate than Yoshida's."""
+def test_suzuki_errs_less_than_yoshida_at_the_same_cost():
+    """At equal evaluations of the force, Suzuki's composition errs less than half as much as Yoshida's."""
     case = CASES["henon-heiles"]
     end = truth(case, [0.0, 10.0])[-1]
     error = {}

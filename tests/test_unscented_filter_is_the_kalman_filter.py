@@ -1,4 +1,4 @@
-"""On linear models the unscented filter is the Kalman filter; on others it is the textbook unscented filter."""
+"""On linear models the unscented filter is the Kalman filter; on others the textbook's own."""
 
 import equinox as eqx
 import estimation_cases as cases
@@ -55,7 +55,7 @@ def test_a_row_wholly_missing_contributes_nothing():
 
 @pytest.mark.parametrize("known", ["start", "dynamics", "both"])
 def test_singular_covariances_are_served(known):
-    """A start or dynamics known exactly, wholly or in part, still gives the Kalman filter and finite slopes."""
+    """A start or dynamics known exactly, wholly or in part, still gives the Kalman filter and slopes."""
     zero = np.zeros((3, 3))
     Q = {"start": None, "dynamics": np.diag([0.0, 0.0, 0.2]), "both": zero}[known]
     P0 = {"start": zero, "dynamics": np.diag([0.0, 1.0, 0.0]), "both": zero}[known]
@@ -116,8 +116,8 @@ def test_nonlinear_models_give_the_textbook_unscented_filter(alpha, tolerance):
     """On a pendulum seen by its angle the score is that of the filter with explicit weights, at any alpha."""
     ys, model = pendulum_readings(), pendulum_model()
     expected = cases.unscented_log_likelihood(
-        pendulum_step, lambda x: x[:1], 1e-4 * np.eye(2), 0.04 * np.eye(1), np.array([1.5, 0.0]), 0.1 * np.eye(2),
-        ys, alpha,
+        pendulum_step, lambda x: x[:1], 1e-4 * np.eye(2), 0.04 * np.eye(1), np.array([1.5, 0.0]),
+        0.1 * np.eye(2), ys, alpha,
     )  # fmt: skip
     assert float(SCORE(model, ys, SPANS, None, UnscentedTransform(alpha))) == pytest.approx(
         expected, rel=tolerance
@@ -135,7 +135,7 @@ def scored(vector, ys):
 
 
 def test_derivatives_are_finite_differences_in_both_modes():
-    """Forward and reverse derivatives agree with each other and with central differences, missing rows included."""
+    """Forward and reverse derivatives agree with central differences, missing rows included."""
     ys = pendulum_readings()
     ys[4] = np.nan
     at = jnp.array([1.02, -8.0])
@@ -150,7 +150,7 @@ def test_derivatives_are_finite_differences_in_both_modes():
 
 
 def test_a_failed_filter_says_so_and_stays_clean():
-    """Where a trajectory escapes or a variance is negative the score is -inf, `ok` False, forward slopes 0."""
+    """Where a trajectory escapes or a variance is negative: score -inf, `ok` False, forward slopes 0."""
     ys = pendulum_readings()
     values, slopes = jax.jit(
         jax.vmap(lambda v: (scored(v, ys), jax.jacfwd(scored)(v, ys)))

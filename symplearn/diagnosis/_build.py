@@ -1,6 +1,6 @@
 """From a simulation file and its recordings to the problem that is fitted."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,11 +18,16 @@ from .._simulation_records import Quantity, SimulationFile, Term
 from .._symbolic import TooLarge
 from .._thinning import highest_frequency
 from ._problem import Calibrated, InitialPrior, Problem
+from ._stochastic import free_run
+from ._trajectory import courses
 
 # Substeps per shortest period of the motion to begin with; the search refines it by doubling.
 SUBSTEPS = 8
 # Tao's binding turns the copies by this angle per substep; far larger ones make the composition lose its order.
 _BINDING = 0.2
+# Substeps are fine enough when halving them changes no reading by more than this share of its noise.
+_CHANGE = 0.02
+_HALVINGS = 5
 
 
 @dataclass(frozen=True)
@@ -179,3 +184,30 @@ def restriction_of(effects: str | None, sensor_only: bool, dynamics_only: bool) 
 def rows_fitted(rows: Sequence[Rows]) -> list[int]:
     """How many rows of each recording are for fitting."""
     return [r.fitted for r in rows]
+
+
+def refined(
+    rebuild: Callable[[float], Problem], problem: Problem, z: np.ndarray, noise: np.ndarray, substep: float
+) -> Problem:
+    """Halve the substep until the readings of a trajectory change by far less than their noise, at most five times.
+
+    `rebuild` lays the problem out again with another longest substep.
+    """
+    coarse = _trajectories(problem, z)
+    for _ in range(_HALVINGS):
+        finer = rebuild(substep / 2)
+        fine = _trajectories(finer, z)
+        change = np.max([np.max(np.abs(a - b), axis=0) for a, b in zip(coarse, fine, strict=True)], axis=0)
+        if not np.isfinite(change).all() or (change < _CHANGE * noise).all():
+            return problem
+        problem, coarse, substep = finer, fine, substep / 2
+    return problem
+
+
+def _trajectories(problem: Problem, z: np.ndarray) -> list[np.ndarray]:
+    out = []
+    for r, course in enumerate(courses(problem)):
+        rows = slice(0, problem.rows[r].fitted)
+        x = z[r * problem.state : (r + 1) * problem.state]
+        out.append(np.asarray(free_run(problem, course, z, (), r, x, rows)[0]))
+    return out

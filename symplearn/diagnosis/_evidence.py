@@ -74,17 +74,20 @@ def _half_spaces(
     return mass - float(prior)
 
 
-def variance_inflation(scores: Float[np.ndarray, "time z"], blocks: int = 24) -> float:
+def variance_inflation(scores: Float[np.ndarray, "time z"], blocks: tuple[int, ...] = (12, 24, 48)) -> float:
     """How much larger the variance of the summed score is over blocks of time than whitened rows would have it.
 
     One where the remainder was whitened rightly; large where it is not white on the scale of the motion, so that
-    Bayes factors claim more than the data hold (a batch-means estimate of the long-run variance; Geyer 1992).
+    Bayes factors claim more than the data hold (a batch-means estimate of the long-run variance; Geyer 1992). The
+    longest blocks that tell most count.
     """
     scores = scores[:, np.abs(scores).sum(0) > 0]
-    size = len(scores) // blocks
-    if size < 4 or scores.shape[1] == 0:
-        return 1.0
-    sums = scores[: size * blocks].reshape(blocks, size, -1).sum(1)
-    between = sums.var(0, ddof=1) / size
-    within = (scores**2).mean(0)
-    return float(np.median(between / np.maximum(within, _TINY)))
+    found = [1.0]
+    for number in blocks:
+        size = len(scores) // number
+        if size < 4 or scores.shape[1] == 0:
+            continue
+        sums = scores[: size * number].reshape(number, size, -1).sum(1)
+        within = np.maximum((scores**2).mean(0), _TINY)
+        found.append(float(np.median(sums.var(0, ddof=1) / size / within)))
+    return max(found)

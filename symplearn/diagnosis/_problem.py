@@ -15,7 +15,7 @@ import integrators as ig
 from .._augmented import Equations
 from .._rows import Rows
 
-SLOTS = 4  # effects in the largest combination
+SLOTS = 3  # effects in the largest combination
 
 Combination = tuple[int, ...]  # places in `Equations.candidates`, in increasing order
 

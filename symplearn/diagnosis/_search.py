@@ -7,12 +7,12 @@ from itertools import combinations
 
 import numpy as np
 
-from ._calibrate import Fits, Priors, grow
+from ._calibrate import Priors, grow
 from ._noisy import PathFit, fit_paths
 from ._problem import SLOTS, Combination, Problem
-from ._start import first_fits, priors_without_effects, scales, typical_forces, windows
+from ._start import priors_without_effects, scales, typical_forces, windows
 from ._stochastic import run_filter
-from ._trajectory import Stepper
+from ._trajectory import LANES, Stepper
 from ._weighed import Estimate, weigh_coloured, weigh_white
 
 # A window grows in these steps, so that a trajectory fit is not caught in a local minimum.
@@ -37,7 +37,15 @@ class Found:
     def add(self, estimate: Estimate) -> None:
         """Keep the better of two estimates of the same combination and kind."""
         kinds = self.estimates.setdefault(estimate.combination, [])
-        kinds.append(estimate)
+        same = [e for e in kinds if e.kind == estimate.kind]
+        if not same:
+            kinds.append(estimate)
+        elif estimate.log_evidence > same[0].log_evidence:
+            kinds[kinds.index(same[0])] = estimate
+
+    def of(self, combination: Combination, kind: str) -> Estimate | None:
+        """The estimate of a combination under one kind of remainder, None where there is none."""
+        return next((e for e in self.estimates.get(combination, []) if e.kind == kind), None)
 
     def best(self, combination: Combination) -> float:
         """The largest log evidence of a combination over kinds."""
@@ -47,20 +55,19 @@ class Found:
 class Search:
     """Finds which combinations of effects explain the recordings of a problem, and with what evidence."""
 
-    def __init__(self, problem: Problem, jobs: int, deadline: float, progress: Callable[[str], None]):
-        self.problem, self.stepper = problem, Stepper(problem, jobs)
-        self.rows = [r.fitted for r in problem.rows]
+    def __init__(
+        self, stepper: Stepper, seeds: np.ndarray, deadline: float, progress: Callable[[str], None]
+    ):
+        self.problem, self.stepper, self.seeds, self.seed = stepper.problem, stepper, seeds, seeds[0]
+        self.rows = [r.fitted for r in self.problem.rows]
         self.deadline, self.progress = deadline, progress
-        self.fits: dict[Combination, Fits] = {}
 
     def run(self) -> Found:
         """Search, smallest combinations first."""
         self.progress("calibrating the simulation")
         bare = priors_without_effects(self.problem)
-        seeds = first_fits(self.stepper, bare, self.rows)
-        self.seed = seeds.z[0]
         self.found = Found(bare)
-        self._add_null(bare, seeds.z)
+        self._add_null(bare)
         self.progress("following the recording with a missing force")
         self.null_paths = self._null_paths(bare)
         best = max(self.null_paths, key=lambda fit: fit.laplace.log_evidence)
@@ -72,8 +79,10 @@ class Search:
                 break
             self.progress(f"weighing {len(candidates)} combinations of {size} effect{'s' * (size > 1)}")
             self._weigh(candidates)
-            if size > 1 and not self._gained(size):
+            self._exchange(size)
+            if size > 1 and self._long and not self._gained(size):
                 break
+        self._weigh_subsets()
         self.progress("weighing missing forces beside the best combinations")
         self._weigh_forces()
         return self.found
@@ -83,8 +92,10 @@ class Search:
             self.found.complete = False
         return self.found.complete
 
-    def _add_null(self, priors: Priors, starts: np.ndarray) -> None:
-        fits = grow(self.stepper, starts[:8], [()] * len(starts[:8]), priors, self._windows())
+    def _add_null(self, priors: Priors) -> None:
+        """The simulation as it is, from the best few starts."""
+        starts = self.seeds[:LANES]
+        fits = grow(self.stepper, starts, [()] * len(starts), priors, self._windows(), final=20)
         white = weigh_white(self.problem, fits, priors, self.rows)
         best = int(np.argmax([e.log_evidence for e in white]))
         self.found.add(white[best])
@@ -96,7 +107,6 @@ class Search:
     def _null_paths(self, priors: Priors) -> list[PathFit]:
         """The simulation without effects under missing forces of several intensities."""
         problem = self.problem
-        white = self.found.estimates[()][0]
         starts = []
         guess = self._rough_noise()
         first = [self._filtered_path(r, self.seed, guess) for r in range(len(self.rows))]
@@ -105,8 +115,6 @@ class Search:
             start = PathFit((), self._intensity(share), self.seed, guess, first)
             starts.append(start)
         fits = fit_paths(self.stepper, starts, priors, self.rows)
-        trajectory = PathFit((), self._intensity(_SHARES[0]), white.z, white.noise, first)
-        del trajectory
         self._add_paths(fits)
         return fits
 
@@ -136,7 +144,7 @@ class Search:
         force = typical_forces(problem, z, [np.tile(x, (1, 1))] * len(self.rows))
         span = float(np.median(np.diff(problem.rows[r].times)))
         intensity = np.maximum(force, np.abs(force).max() * 1e-3) ** 2 * span * 10
-        _, filtered = run_filter(problem, course, r, z, (), noise, intensity, spread, self.rows[r])
+        _, filtered = run_filter(problem, course, r, z, (), noise, 0 * noise, intensity, spread, self.rows[r])
         means = np.array(filtered.filtered_means)
         means[0] = x
         return means if bool(filtered.ok) else np.tile(x, (self.rows[r], 1))
@@ -157,30 +165,72 @@ class Search:
         more = {tuple(sorted((*c, one))) for c in kept for one in searched if one not in c}
         return sorted(more)
 
+    def _exchange(self, size: int) -> None:
+        """Exchange single members of the best combinations of one size, so that no rival is missed."""
+        if size == 1 or not self._in_time():
+            return
+        mine = sorted((c for c in self.found.estimates if len(c) == size), key=self.found.best, reverse=True)
+        swapped = {
+            tuple(sorted((*c[:k], *c[k + 1 :], one)))
+            for c in mine[: _KEPT // 2]
+            for k in range(size)
+            for one in self.problem.searched
+            if one not in c
+        }
+        missing = sorted(swapped - set(self.found.estimates))
+        if missing:
+            self.progress(f"exchanging members: {len(missing)} more combinations of {size} effects")
+            self._weigh(missing)
+
     def _gained(self, size: int) -> bool:
         """Whether the best of this size beats the best of smaller ones, so that a larger one may be worth it."""
         smaller = max(self.found.best(c) for c in self.found.estimates if len(c) < size)
         return max(self.found.best(c) for c in self.found.estimates if len(c) == size) > smaller
 
     def _weigh(self, candidates: Sequence[Combination]) -> None:
-        priors = self.found.priors
+        """Fit and weigh combinations; on a long recording most are dropped after its first part."""
         start = np.tile(self.seed, (len(candidates), 1))
         start[:, self.problem.head + self.problem.calibrated.size :] = 0.0
-        fits = grow(self.stepper, start, candidates, priors, self._windows())
-        for estimate in weigh_white(self.problem, fits, priors, self.rows):
+        growing = self._windows()
+        cut = self._first_part(growing)
+        if cut < len(growing) and len(candidates) > _KEPT:
+            fits = grow(self.stepper, start, candidates, self.found.priors, growing[:cut], final=20)
+            values = [e.log_evidence for e in weigh_white(self.problem, fits, self.found.priors, growing[cut - 1])]
+            kept = np.argsort(values)[::-1][:_KEPT]
+            start, candidates, growing = fits.z[kept], [candidates[k] for k in kept], growing[cut:]
+        fits = grow(self.stepper, start, candidates, self.found.priors, growing)
+        for estimate in weigh_white(self.problem, fits, self.found.priors, self.rows):
             self.found.add(estimate)
-        for estimate in weigh_coloured(self.problem, fits, priors, self.rows):
+        for estimate in weigh_coloured(self.problem, fits, self.found.priors, self.rows):
             self.found.add(estimate)
+
+    @property
+    def _long(self) -> bool:
+        """Whether the recordings are too long for every combination to see all of them."""
+        return self._first_part(self._windows()) < len(_GROWTH)
+
+    def _first_part(self, growing: list[list[int]]) -> int:
+        """How many of the growing windows are affordable for every combination."""
+        pieces = self.problem.rows[0].spans.inputs.shape[1]
+        return max(1, sum(sum(rows) * pieces <= _AFFORDABLE for rows in growing))
+
+    def _weigh_subsets(self) -> None:
+        """What the best combinations become without each of their members, where that was not weighed yet."""
+        ranked = sorted((c for c in self.found.estimates if c), key=self.found.best, reverse=True)[:_KEPT]
+        less = {c[:k] + c[k + 1 :] for c in ranked for k in range(len(c))}
+        missing = sorted(c for c in less if c and c not in self.found.estimates)
+        if missing:
+            self._weigh(missing[:_KEPT])
 
     def _weigh_forces(self) -> None:
         """Best combinations again, each with a missing force beside it."""
         named = [c for c in self.found.estimates if c]
-        contenders = sorted(named, key=self.found.best, reverse=True)[:_KEPT]
+        contenders = sorted(named, key=self.found.best, reverse=True)[: _KEPT // 2 if self._long else _KEPT]
         null = max(self.null_paths, key=lambda fit: fit.laplace.log_evidence)
         starts = []
         for c in contenders:
-            white = self.found.estimates[c][0]
-            for share in _SHARES[:-1]:
+            white = self.found.of(c, "white")
+            for share in _SHARES[: -1 : 2 if self._long else 1]:
                 starts.append(PathFit(c, self._intensity(share), white.z, null.noise, null.paths))
         self._add_paths(fit_paths(self.stepper, starts, self.found.priors, self.rows))
 

@@ -51,9 +51,15 @@ class _Scaled(eqx.Module):
         return self.inner(x, row) * root
 
 
-@eqx.filter_jit
-def _filter(equations, integrator, course, calibrated, coefficients, noise, force, initial, readings, roots):
+def filter_lane(
+    equations, integrator, course, calibrated, coefficients, noise, intensity, soft, x, spread, readings, roots
+) -> tuple[StateSpaceModel, Any, Any, Filtered]:
+    """Filter the leading rows that `readings` covers from N(x, spread); also the model and what it was given.
+
+    `noise` is that of one original reading; `roots` (time, channel) the root of each row's information in its units.
+    """
     flow, read = model_at(equations, integrator, course, calibrated, coefficients)
+    force, initial = MissingForce(intensity, soft), Gaussian(x, spread)
     model = StateSpaceModel(flow, _Scaled(read), force, _RowNoise(noise**2), initial)
     n = readings.shape[0]
     spans = jax.tree.map(lambda leaf: leaf[: n - 1], course.spans)
@@ -61,15 +67,22 @@ def _filter(equations, integrator, course, calibrated, coefficients, noise, forc
     return model, spans, contexts, unscented_filter(model, readings * roots, spans, contexts)
 
 
+_filter = eqx.filter_jit(filter_lane)
+
+
 @eqx.filter_jit
 def _smooth(model, filtered, spans, contexts):
     return smooth(model, filtered, spans, contexts)
 
 
-def row_roots(problem: Problem, recording: int, rows: int) -> np.ndarray:
-    """Square root of each row's information in units of one reading's (time, channel); 1 where there is none."""
+def row_roots(problem: Problem, recording: int, rows: int, ratio: Float[np.ndarray, " channel"]) -> np.ndarray:
+    """Square root of each row's information in units of one reading's (time, channel); 1 where there is none.
+
+    `ratio` is the variance of a coloured error over the white one: averaging rows does not make it smaller.
+    """
     counts = problem.rows[recording].counts[:rows]
-    return np.sqrt(np.where(counts > 1, counts / THINNED, 1.0))
+    white = np.where(counts > 1, THINNED / np.where(counts > 1, counts, 1.0), 1.0)
+    return np.sqrt((1.0 + ratio) / (white + ratio))
 
 
 def softness(problem: Problem, course: Course, z: np.ndarray, recording: int) -> np.ndarray:
@@ -87,18 +100,19 @@ def run_filter(
     z: Float[np.ndarray, " z"],
     combination: Combination,
     noise: Float[np.ndarray, " channel"],
+    ratio: Float[np.ndarray, " channel"],
     intensity: Float[np.ndarray, " d"],
     spread: Float[np.ndarray, "state state"],
     rows: int,
+    seen: int | None = None,
 ) -> tuple[Any, Filtered]:
-    """Filter the first `rows` rows from the phase point in `z` with covariance `spread`; also returns its inputs."""
-    onehot = problem.onehot(combination)
-    head, f = problem.head, problem.calibrated.size
-    x = z[recording * problem.state : (recording + 1) * problem.state]
-    initial = Gaussian(jnp.asarray(x), jnp.asarray(spread))
-    force = MissingForce(jnp.asarray(intensity), jnp.asarray(softness(problem, course, z, recording)))
-    readings = jnp.asarray(problem.rows[recording].readings[:rows])
-    roots = jnp.asarray(row_roots(problem, recording, rows))
+    """Filter the first `rows` rows from the phase point in `z` with covariance `spread`; also returns its inputs.
+
+    Readings from row `seen` on are hidden from the filter.
+    """
+    onehot, head, f = problem.onehot(combination), problem.head, problem.calibrated.size
+    readings = problem.rows[recording].readings[:rows].copy()
+    readings[seen if seen is not None else rows :] = np.nan
     model, spans, contexts, filtered = _filter(
         problem.equations,
         problem.integrator,
@@ -106,10 +120,12 @@ def run_filter(
         jnp.asarray(z[head : head + f]),
         jnp.asarray(z[head + f :] @ onehot),
         jnp.asarray(noise),
-        force,
-        initial,
-        readings,
-        roots,
+        jnp.asarray(intensity),
+        jnp.asarray(softness(problem, course, z, recording)),
+        jnp.asarray(z[recording * problem.state : (recording + 1) * problem.state]),
+        jnp.asarray(spread),
+        jnp.asarray(readings),
+        jnp.asarray(row_roots(problem, recording, rows, ratio)),
     )
     return (model, spans, contexts), filtered
 
@@ -120,16 +136,19 @@ def run_smoother(parts: Any, filtered: Filtered) -> Smoothed:
     return _smooth(model, filtered, spans, contexts)
 
 
-def free_run(problem: Problem, course: Course, z: np.ndarray, combination: Combination, x: Any, rows: slice) -> Any:
-    """Readings over `rows` of a run that starts from the phase point `x` at its first row and looks at no reading."""
-    onehot, head, f = problem.onehot(combination), problem.head, problem.calibrated.size
+def free_run(
+    problem: Problem, course: Course, z: np.ndarray, combination: Combination, recording: int, x: Any, rows: slice
+) -> tuple[Float[Array, "time channel"], Float[Array, "time state"]]:
+    """Readings and phase points over `rows` of a run that starts from `x` at the first of them and looks at nothing."""
+    coefficients = problem.coefficients(recording, z, combination) - problem.coefficients(recording, z, ())
+    head, f = problem.head, problem.calibrated.size
     part = jax.tree.map(lambda leaf: leaf[rows], (course.spans, course.times, course.inputs))
     return _run(
         problem.equations,
         problem.integrator,
         eqx.tree_at(lambda c: (c.spans, c.times, c.inputs), course, part),
         jnp.asarray(z[head : head + f]),
-        jnp.asarray(z[head + f :] @ onehot),
+        jnp.asarray(coefficients),
         jnp.asarray(x),
     )
 

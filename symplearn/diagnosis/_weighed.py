@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ._calibrate import Fits, Priors, normal_equations, residuals, weights
-from ._coloured import Colour, fit_colour, whitened_gram
+from ._coloured import Colour, fit_colour, whitened_gram, whitened_series
 from ._evidence import Laplace, laplace, variance_inflation
 from ._problem import Combination, Problem
+from ._trajectory import Stepper
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class Estimate:
     inflation: float = 1.0
     intensity: Float[np.ndarray, " d"] | None = None
     paths: list[np.ndarray] | None = field(default=None, repr=False)
+    colours: tuple[Colour, ...] = ()
 
 
 class Kind(Protocol):
@@ -64,18 +66,19 @@ def weigh_coloured(problem: Problem, fits: Fits, priors: Priors, rows: list[int]
     times = [rows_.times[:n] for rows_, n in zip(problem.rows, rows, strict=True)]
     size = 1 + problem.size
     grams, logs = np.zeros((lanes, problem.channels, size, size)), np.zeros((lanes, problem.channels))
-    occam = np.zeros(lanes)
+    chosen: list[list[Colour]] = []
     for j in range(problem.channels):
         known = None if np.isnan(problem.noise[j]) else float(problem.noise[j])
         colours = fit_colour([x[..., j] for x in r], [w[:, j] for w in weight], times, known)
-        occam += [colour.occam for colour in colours]
+        chosen.append(colours)
         for k in range(len(times)):
             gram, log = _channel_gram(problem, fits, r[k][..., j], weight[k][:, j], times[k], colours, k, j)
             grams[:, j] += gram
             logs[:, j] += log
     number = sum((w > 0).sum(0) for w in weight)
     return [
-        _coloured_estimate(problem, fits, b, grams[b], logs[b], number, occam[b], priors) for b in range(lanes)
+        _coloured_estimate(problem, fits, b, grams[b], logs[b], number, tuple(c[b] for c in chosen), priors)
+        for b in range(lanes)
     ]
 
 
@@ -89,7 +92,9 @@ def _channel_gram(problem, fits: Fits, residual, weight, times, colours: list[Co
     return full, log
 
 
-def _coloured_estimate(problem, fits: Fits, b: int, grams, logs, number, occam: float, priors: Priors) -> Estimate:
+def _coloured_estimate(
+    problem, fits: Fits, b: int, grams, logs, number, colours: tuple[Colour, ...], priors: Priors
+) -> Estimate:
     """Integrate the unknowns with each channel's white noise at its best value, found by alternation."""
     combination, noise = fits.combinations[b], fits.noise[b].copy()
     free = np.isnan(problem.noise)
@@ -101,8 +106,9 @@ def _coloured_estimate(problem, fits: Fits, b: int, grams, logs, number, occam: 
         square = np.einsum("i,jik,k->j", column, grams, column)
         noise = np.where(free, np.sqrt(np.maximum(square, 1e-300) / np.maximum(number, 1)), noise)
     z = fits.z[b] + one.step
-    return Estimate(combination, "coloured", z, one.covariance, noise, one.log_evidence + occam,
-                    bool(fits.converged[b]))  # fmt: skip
+    value = one.log_evidence + sum(colour.occam for colour in colours)
+    return Estimate(combination, "coloured", z, one.covariance, noise, value, bool(fits.converged[b]),
+                    colours=colours)  # fmt: skip
 
 
 def _laplace(problem: Problem, combination: Combination, gram, offset: float, z, priors: Priors) -> Laplace:
@@ -122,6 +128,23 @@ def _constant(weight: list[np.ndarray], noise: np.ndarray) -> np.ndarray:
 def information(weight: list[np.ndarray]) -> float:
     """Sum of the log weights of the rows, which every kind of remainder owes for readings that are averages."""
     return float(sum(np.log(w[w > 0]).sum() for w in weight))
+
+
+def coloured_inflation(stepper: Stepper, estimate: Estimate, rows: list[int]) -> float:
+    """Variance inflation that is left after a coloured error was whitened."""
+    problem, weight = stepper.problem, weights(stepper.problem, rows)
+    predictions = stepper.predict(estimate.z[None], [estimate.combination], rows)
+    fits = Fits([estimate.combination], estimate.z[None], estimate.noise[None], predictions, np.zeros(1), np.ones(1, bool))
+    parts = []
+    for k, (x, w) in enumerate(zip(residuals(problem, predictions, weight), weight, strict=True)):
+        total = 0.0
+        for j, colour in enumerate(estimate.colours):
+            slopes = np.where(w[:, j] > 0, predictions[k].slopes[0, problem.state :, :, j], 0.0)
+            columns = np.concatenate([x[0, None, :, j], slopes]) / fits.noise[0, j]
+            series = whitened_series(columns, w[:, j], problem.rows[k].times[: len(w)], colour)
+            total = total + series[:, :1] * series[:, 1:]
+        parts.append(total)
+    return variance_inflation(np.concatenate(parts))
 
 
 def _scores(problem: Problem, fits: Fits, b: int, r, weight) -> np.ndarray:

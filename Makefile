@@ -1,0 +1,70 @@
+.POSIX:
+.PHONY: help demo test test-slow test-recordings lock clean
+
+VENV = .venv
+PYTHON = $(VENV)/bin/python
+PIP = $(PYTHON) -m pip --disable-pip-version-check --quiet
+OPTIONS =
+
+help: ## print this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' Makefile
+
+demo: $(VENV)/project.stamp ## diagnose the recording that ships inside the package
+	@$(VENV)/bin/symplearn demo
+
+test: $(VENV)/project.stamp ## linter, formatter, types, and every test of seconds
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+	$(VENV)/bin/pytest -m "not slow"
+
+test-slow: $(VENV)/project.stamp ## the tests of minutes
+	$(VENV)/bin/pytest -m slow
+
+test-recordings: $(VENV)/project.stamp ## the tests on real recordings, which fail where the recordings are absent
+	SYMPLEARN_REQUIRE_RECORDINGS=1 $(VENV)/bin/pytest -m recordings
+
+# Two stamps: a new lock makes the environment anew, a new pyproject.toml only installs the project again.
+# A stamp is the last thing written, so an interrupted run starts over.
+$(VENV)/lock.stamp: requirements.lock
+	@python=; for candidate in python3.12 python3.11 python3; do \
+	    if "$$candidate" -c '$(USABLE)' >/dev/null 2>&1; then python=$$candidate; break; fi; \
+	done; \
+	if [ -z "$$python" ]; then \
+	    echo "symplearn needs Python 3.11, 3.12 or 3.13 with its venv module (on Debian: python3-venv) as" \
+	        "python3.12, python3.11 or python3 on the PATH." >&2; \
+	    exit 1; \
+	fi; \
+	echo "Making $(VENV) with $$("$$python" --version) from requirements.lock: once, a few minutes."; \
+	"$$python" -m venv --clear $(VENV)
+	@$(PIP) install --only-binary :all: --require-hashes -r requirements.lock
+	@touch $@
+
+USABLE = import ensurepip, sys, venv; sys.exit(not (3, 11) <= sys.version_info < (3, 14))
+
+$(VENV)/project.stamp: $(VENV)/lock.stamp pyproject.toml
+	@$(PIP) install --no-deps --no-build-isolation --editable .
+	@$(PIP) check
+	@touch $@
+
+# Resolved by Python 3.11, the oldest we support, from the public index alone whatever pip is configured to here.
+# Keeps the versions already pinned; `make lock OPTIONS=--upgrade` takes the newest.
+lock: ## pin what pyproject.toml asks for: names, versions, hashes
+	@rm -rf .venv-lock && python3.11 -m venv .venv-lock
+	@.venv-lock/bin/python -m pip --disable-pip-version-check --quiet install 'pip-tools>=7.5'
+	@.venv-lock/bin/python -c '$(REQUIREMENTS)' > .venv-lock/requirements.in
+	@PIP_CONFIG_FILE=/dev/null PIP_FIND_LINKS= PIP_EXTRA_INDEX_URL= CUSTOM_COMPILE_COMMAND='make lock' \
+	    .venv-lock/bin/pip-compile --quiet --no-annotate --generate-hashes --strip-extras --allow-unsafe \
+	    --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
+	    $(OPTIONS) --output-file requirements.lock .venv-lock/requirements.in
+	@rm -rf .venv-lock
+	@echo "Wrote requirements.lock."
+
+REQUIREMENTS = import tomllib; \
+	p = tomllib.load(open("pyproject.toml", "rb")); \
+	lists = p["build-system"]["requires"], p["project"]["dependencies"], p["dependency-groups"]["dev"]; \
+	print("\n".join(sum(lists, [])))
+
+clean: ## remove the environment and everything else that can be made again
+	rm -rf $(VENV) .venv-lock build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,154 @@
+"""The `symplearn` command."""
+
+import os
+import sys
+import time
+from importlib import resources
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from ._errors import InputError
+
+app = typer.Typer(
+    name="symplearn",
+    help="Say what physics a simulation left out, from recordings that disagree with it.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+_Positive = Annotated[int, typer.Option(min=1, help="Threads; the answer does not depend on it.")]
+
+
+@app.command()
+def diagnose(
+    simulation: Annotated[Path, typer.Argument(help="The simulation file (TOML).", show_default=False)],
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings (CSV, .csv.gz).", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder that the report is written to.")] = Path("diagnosis"),
+    seed: Annotated[int, typer.Option(help="Same seed, same files: same answer.")] = 0,
+    holdout: Annotated[float, typer.Option(help="Last part of each recording, kept from every fit.")] = 0.25,
+    forecast_until: Annotated[float | None, typer.Option(help="Forecast up to this time.")] = None,
+    forecast_step: Annotated[float | None, typer.Option(help="Spacing of the forecast.")] = None,
+    effects: Annotated[str | None, typer.Option(help="Search these effects only (comma separated).")] = None,
+    sensor_only: Annotated[bool, typer.Option("--sensor-only", help="Search effects of the sensors only.")] = False,
+    dynamics_only: Annotated[bool, typer.Option("--dynamics-only", help="Search effects of the dynamics only.")] = False,
+    jobs: _Positive = os.cpu_count() or 1,
+    time_limit: Annotated[float | None, typer.Option(help="Cut the search short after these seconds.")] = None,
+    fail_on_mismatch: Annotated[
+        bool, typer.Option("--fail-on-mismatch", help="Exit with 3 unless the verdict is `consistent`.")
+    ] = False,
+    cache: Annotated[bool, typer.Option(help="Keep compiled programs under the user's cache folder.")] = True,
+) -> None:
+    """Locate what differs between SIMULATION and RECORDINGS, name what was left out and show the fit without and with it."""
+    if not 0 <= holdout < 1:
+        raise InputError(f"--holdout: is {holdout}; give a share from 0 up to, but not including, 1")
+    if time_limit is not None and not time_limit > 0:
+        raise InputError(f"--time-limit: is {time_limit}; give a positive number of seconds")
+    if forecast_step is not None and forecast_until is None:
+        raise InputError("--forecast-step: needs --forecast-until; give the time to forecast to")
+    _prepare_jax(cache)
+    from ._recording import read_recordings
+    from ._simulation_file import read_simulation
+    from .diagnosis import Options, restriction_of
+    from .diagnosis import diagnose as run
+    from .report import prepare_directory, summary, write_outputs
+
+    restriction = restriction_of(effects, sensor_only, dynamics_only)
+    file = read_simulation(simulation)
+    read = read_recordings(file, recordings)
+    folder = prepare_directory(out)
+    with _Progress() as progress:
+        found = run(
+            file,
+            read,
+            Options(
+                holdout=holdout,
+                seed=seed,
+                restriction=restriction,
+                jobs=jobs,
+                time_limit=time_limit if time_limit is not None else float("inf"),
+                forecast_until=forecast_until,
+                forecast_step=forecast_step,
+                progress=progress.say,
+            ),
+        )
+        progress.say("writing the report")
+        write_outputs(found, folder)
+    Console().print(summary(found, folder))
+    if fail_on_mismatch and found.document["verdict"] != "consistent":
+        raise typer.Exit(3)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder that the report is written to.")] = Path("diagnosis"),
+) -> None:
+    """Diagnose the case that ships with symplearn: an effect concealed below the reading noise."""
+    with resources.as_file(resources.files("symplearn") / "demo") as folder:
+        diagnose(folder / "simulation.toml", [folder / "recording.csv"], out=out)
+
+
+class _Progress:
+    """What is being done, on stderr, from the second second on."""
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True)
+        self._begin = time.monotonic()
+        self._status = self._console.status("", spinner="line") if self._console.is_terminal else None
+
+    def __enter__(self) -> "_Progress":
+        if self._status:
+            self._status.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._status:
+            self._status.stop()
+
+    def say(self, message: str) -> None:
+        """Tell what comes next."""
+        passed = time.monotonic() - self._begin
+        if self._status:
+            self._status.update(f"{passed:4.0f} s  {message}")
+        else:
+            self._console.print(f"{passed:6.1f} s  {message}", markup=False, highlight=False)
+
+
+def _prepare_jax(cache: bool) -> None:
+    """Double precision, and compiled programs kept in a private folder of the user's cache."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    if not cache:
+        return
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "symplearn" / "jax"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.parent.chmod(0o700)
+        folder.chmod(0o700)
+    except OSError:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def main() -> None:
+    """Run the command; wrong input is one line on stderr and exit code 2, a failure one line and exit code 1."""
+    try:
+        app()
+    except InputError as error:
+        print(f"symplearn: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("symplearn: stopped; nothing was written", file=sys.stderr)
+        sys.exit(130)
+    except Exception as error:
+        print(f"symplearn: failed: {type(error).__name__}: {error}", file=sys.stderr)
+        if os.environ.get("SYMPLEARN_TRACEBACK"):
+            raise
+        sys.exit(1)

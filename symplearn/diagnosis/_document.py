@@ -1,0 +1,125 @@
+"""The answer as the contract words it: diagnosis.json (section 4) as plain data."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.stats import norm, truncnorm
+
+from .._recording import Recording
+from ._locate import kind_and_targets, whole_windows
+from ._outlook import Outlook
+from ._posterior import Posterior, Weighed
+from ._problem import Problem
+from ._weighed import Estimate
+
+# Alternatives listed one by one; the rest is `other`.
+_LISTED = 12
+_LEAST = 5e-4
+
+
+def coefficient(problem: Problem, estimate: Estimate, slot: int, inflation: float) -> dict[str, Any]:
+    """Mean, sd and 95 % interval of one slot's coefficient, cut off where its sign is physical."""
+    place = problem.head + problem.calibrated.size + slot
+    mean = float(estimate.z[place])
+    sd = float(np.sqrt(estimate.covariance[place, place] * inflation))
+    lower = problem.lower_bounds(estimate.combination).get(place)
+    if lower is None or mean - lower > 5 * sd:
+        low, high = (float(x) for x in norm.interval(0.95, mean, sd))
+    else:
+        law = truncnorm((lower - mean) / sd, np.inf, mean, sd)
+        low, high = (float(x) for x in law.ppf([0.025, 0.975]))
+        mean, sd = float(law.mean()), float(law.std())
+    return {"mean": mean, "sd": sd, "interval95": [low, high]}
+
+
+def parameters(problem: Problem, estimate: Estimate, inflation: float) -> dict[str, Any]:
+    """Posterior of everything calibrated."""
+    part = slice(problem.head, problem.head + problem.calibrated.size)
+    sd = np.sqrt(np.diag(estimate.covariance)[part] * inflation)
+    return {
+        name: {"mean": float(m), "sd": float(s)}
+        for name, m, s in zip(problem.calibrated.names, estimate.z[part], sd, strict=True)
+    }
+
+
+def fit(problem: Problem, needed: Estimate, outlooks: Sequence[Outlook], recordings: Sequence[Recording]) -> dict[str, Any]:
+    """Held-out error of the free run in the columns' units, its log density, and the noises.
+
+    Free run and density are those of `outlooks`. `needed` is the same hypothesis with a missing force beside it: the
+    process noise and the reading noise that it takes to follow the fitted rows.
+    """
+    columns, momenta = problem.equations.columns, problem.equations.momenta
+    squares, numbers, density = np.zeros(len(columns)), np.zeros(len(columns)), 0.0
+    for outlook, recording in zip(outlooks, recordings, strict=True):
+        held = recording.times > outlook.rows.boundary
+        if held.any():
+            error = outlook.held_out_errors(recording.times[held], recording.readings[held])
+            squares += np.nansum(error**2, axis=0)
+            numbers += (~np.isnan(error)).sum(0)
+            density += outlook.held_out_log_density()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rmse = np.sqrt(squares / numbers)
+    held_out = bool((numbers > 0).any())
+    intensity = np.zeros(len(momenta)) if needed.intensity is None else np.sqrt(needed.intensity)
+    return {
+        "holdout_rmse": {c: finite(x) for c, x in zip(columns, rmse, strict=True)} if held_out else None,
+        "holdout_log_density": finite(density) if held_out else None,
+        "process_noise_sd": {p: float(x) for p, x in zip(momenta, intensity, strict=True)},
+        "noise_sd": {c: finite(x) for c, x in zip(columns, needed.noise, strict=True)},
+    }
+
+
+def finite(value: float) -> float | None:
+    """A number, or None where it is not one."""
+    return float(value) if np.isfinite(value) else None
+
+
+def alternatives(problem: Problem, posterior: Posterior, verdict: str, chosen: Weighed | None) -> tuple[list[Any], float]:
+    """Everything weighed beside the reported combination, likeliest first, and what is left over."""
+    rows = [_alternative(problem, w.combination, False, w.probability) for w in posterior.named
+            if chosen is None or w.combination != chosen.combination]  # fmt: skip
+    rows = [row for row in rows if row["probability"] > _LEAST][:_LISTED]
+    if verdict != "unexplained":
+        rows.append(_alternative(problem, (), True, posterior.unexplained))
+    if verdict != "consistent":
+        rows.append(_alternative(problem, (), False, posterior.as_it_is))
+    rows.sort(key=lambda row: -row["probability"])
+    reported = {"consistent": posterior.as_it_is, "unexplained": posterior.unexplained}.get(verdict)
+    reported = chosen.probability if reported is None and chosen is not None else reported
+    return rows, max(0.0, 1.0 - float(reported or 0.0) - sum(row["probability"] for row in rows))
+
+
+def _alternative(problem: Problem, combination, unexplained: bool, probability: float) -> dict[str, Any]:
+    found = [problem.equations.candidates[c].key for c in combination]
+    return {
+        "findings": [{"effect": effect, "target": target} for effect, target in found],
+        "unexplained": unexplained,
+        "probability": float(probability),
+    }
+
+
+def family_probability(problem: Problem, posterior: Posterior) -> dict[str, float]:
+    """Probability that an effect of each family is present."""
+    total: dict[str, float] = {}
+    for w in posterior.named:
+        for family in {problem.equations.candidates[c].effect.family for c in w.combination}:
+            total[family] = min(1.0, total.get(family, 0.0) + w.probability)
+    return dict(sorted(total.items(), key=lambda item: -item[1]))
+
+
+def presence(posterior: Posterior, candidate: int) -> float:
+    """Probability that one effect and target is present in any combination."""
+    return min(1.0, sum(w.probability for w in posterior.named if candidate in w.combination))
+
+
+def location(problem: Problem, combination, outlooks: Sequence[Outlook], where: str) -> dict[str, Any]:
+    """The location of a named mismatch."""
+    kind, targets = kind_and_targets(problem, combination)
+    return {
+        "kind": kind,
+        "targets": targets,
+        "recordings": [o.recording + 1 for o in outlooks],
+        "time_windows": whole_windows(outlooks),
+        "where": where,
+    }

@@ -1,0 +1,111 @@
+"""Where the mismatch lives: which equation, which sensor, which times, and what the missing force goes with."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ._outlook import Outlook
+from ._problem import Combination, Problem
+
+# Standardised disturbances are looked at in this many stretches of the recording.
+_STRETCHES = 24
+# A stretch stands out when its mean square is this far above one that holds nothing.
+_STANDS_OUT = 2.5
+
+
+@dataclass(frozen=True)
+class Explained:
+    """Shares of the missing force on one coordinate that go with its speed, its place, and neither."""
+
+    speed: float
+    place: float
+
+    @property
+    def neither(self) -> float:
+        return max(0.0, 1.0 - self.speed - self.place)
+
+
+def explained(outlook: Outlook, coordinate: int) -> Explained:
+    """Regress the smoothed missing force on functions of velocity and of position, each beside the other.
+
+    A group's share is how much the fit loses without it (Type III sums of squares), so nothing is counted twice.
+    """
+    force = outlook.missing_force()[:, coordinate]
+    q, v = motion(outlook)
+    q, v = q[:, coordinate], v[:, coordinate]
+    q, v = q / max(np.abs(q).max(), 1e-300), v / max(np.abs(v).max(), 1e-300)
+    speed, place = np.stack([v, np.abs(v) * v, np.sign(v)], 1), np.stack([np.ones_like(q), q, q**2, q**3], 1)
+    total = max(float((force**2).sum()), 1e-300)
+    full = _left(force, np.concatenate([speed, place], axis=1))
+    return Explained((_left(force, place) - full) / total, (_left(force, speed) - full) / total)
+
+
+def motion(outlook: Outlook) -> tuple[np.ndarray, np.ndarray]:
+    """Smoothed positions and velocities over the fitted rows, each (time, coordinate)."""
+    n = outlook.rows.fitted
+    q = np.asarray(outlook.smoothed.means[:n, : outlook.stepper.problem.equations.dim])
+    return q, np.gradient(q, outlook.rows.times[:n], axis=0)
+
+
+def _left(values: np.ndarray, columns: np.ndarray) -> float:
+    fit = columns @ np.linalg.lstsq(columns, values, rcond=1e-10)[0]
+    return float(((values - fit) ** 2).sum())
+
+
+def strained_windows(outlook: Outlook, coordinate: int) -> list[list[float]]:
+    """Times at which the standardised disturbances stand out; the whole span where all do, or none does."""
+    n, times = outlook.rows.fitted, outlook.rows.times
+    whole = [[float(times[0]), float(times[n - 1])]]
+    series = outlook.strain()[:, coordinate] ** 2
+    edges = np.linspace(0, n, min(_STRETCHES, max(2, n // 8)) + 1).astype(int)
+    level = np.array([series[a:b].mean() for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    out = level > _STANDS_OUT * max(1.0, float(np.median(level)))
+    if out.all() or not out.any():
+        return whole
+    windows: list[list[float]] = []
+    for k in np.nonzero(out)[0]:
+        a, b = float(times[edges[k]]), float(times[min(edges[k + 1], n - 1)])
+        if windows and windows[-1][1] >= a:
+            windows[-1][1] = b
+        else:
+            windows.append([a, b])
+    return windows
+
+
+def strained_coordinates(outlooks: Sequence[Outlook]) -> list[int]:
+    """Coordinates whose equation is strained, the worst first; at least one."""
+    level = np.mean([(o.strain() ** 2).mean(0) for o in outlooks], axis=0)
+    order = [int(i) for i in np.argsort(level)[::-1]]
+    return [i for i in order if level[i] > 0.5 * level[order[0]]]
+
+
+def kind_and_targets(problem: Problem, combination: Combination) -> tuple[str, list[str]]:
+    """`dynamics`, `sensor` or `both`, and the targets, in the order of the combination."""
+    chosen = [problem.equations.candidates[c] for c in combination]
+    places = {c.effect.acts_on for c in chosen}
+    kind = "both" if len(places) == 2 else ("dynamics" if "coordinate" in places else "sensor")
+    return kind, list(dict.fromkeys(c.target for c in chosen))
+
+
+def whole_windows(outlooks: Sequence[Outlook]) -> list[list[float]]:
+    """The whole span of every recording, with its number where there are several."""
+    spans = []
+    for o in outlooks:
+        span: list[float] = [float(o.rows.times[0]), float(o.rows.times[-1])]
+        spans.append(span + [o.recording + 1] if len(outlooks) > 1 else span)
+    return spans
+
+
+def where_sentence(problem: Problem, outlook: Outlook, coordinate: int, shares: Explained) -> str:
+    """What the missing force goes with."""
+    name = problem.equations.coordinates[coordinate]
+    speed, place, rest = (f"{100 * max(0.0, x):.0f} %" for x in (shares.speed, shares.place, shares.neither))
+    if shares.speed > max(shares.place, 0.3):
+        opening = f"the missing force on {name} goes with its speed"
+    elif shares.place > max(shares.speed, 0.3):
+        opening = f"the missing force on {name} goes with its place"
+    else:
+        opening = f"the missing force on {name} follows neither its speed nor its place alone"
+    return f"{opening}: {speed} of it is explained by speed, {place} by position, {rest} by neither"
+

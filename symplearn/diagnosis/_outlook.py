@@ -1,0 +1,147 @@
+"""One hypothesis shown on the recordings: filtered where it was fitted, run freely where it was not."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+
+from .._filter import Filtered
+from .._smoother import Smoothed
+from ._stochastic import free_run, row_roots, run_filter, run_smoother
+from ._trajectory import Stepper
+from ._weighed import Estimate
+
+
+def colour_ratio(estimate: Estimate) -> Float[np.ndarray, " channel"]:
+    """Variance of the coloured reading error over the white one, by channel; zero where there is none."""
+    return np.array([c.ratio for c in estimate.colours]) if estimate.colours else np.zeros(len(estimate.noise))
+
+
+def total_noise(estimate: Estimate) -> Float[np.ndarray, " channel"]:
+    """White and coloured reading noise together, so that a filter without a colour does not trust too much."""
+    return estimate.noise * np.sqrt(1.0 + colour_ratio(estimate))
+
+
+def intensity_of(stepper: Stepper, estimate: Estimate) -> Float[np.ndarray, " d"]:
+    """Intensity of the missing force, zero where the remainder is not one."""
+    return np.zeros(stepper.problem.equations.dim) if estimate.intensity is None else estimate.intensity
+
+
+def start_spread(stepper: Stepper, estimate: Estimate, recording: int) -> Float[np.ndarray, "state state"]:
+    """Posterior covariance of the phase point at the first row."""
+    state = stepper.problem.state
+    part = slice(recording * state, (recording + 1) * state)
+    return estimate.covariance[part, part]
+
+
+@dataclass(frozen=True, eq=False)
+class Outlook:
+    """An estimate on one recording. Times, readings and predictions are by row after thinning."""
+
+    stepper: Stepper
+    estimate: Estimate
+    recording: int
+    intensity: Float[np.ndarray, " d"]
+
+    @property
+    def rows(self) -> Any:
+        return self.stepper.problem.rows[self.recording]
+
+    @cached_property
+    def _filtered(self) -> tuple[Any, Filtered]:
+        e, r = self.estimate, self.recording
+        return run_filter(
+            self.stepper.problem, self.stepper.courses[r], r, e.z, e.combination, total_noise(e), colour_ratio(e),
+            self.intensity, start_spread(self.stepper, e, r), len(self.rows.times), self.rows.fitted,
+        )  # fmt: skip
+
+    @property
+    def ok(self) -> bool:
+        """Whether the filter went through."""
+        return bool(self._filtered[1].ok)
+
+    @cached_property
+    def smoothed(self) -> Smoothed:
+        """State and noises given all fitted rows."""
+        return run_smoother(*self._filtered)
+
+    @cached_property
+    def last_state(self) -> Float[np.ndarray, " state"]:
+        """The phase point filtered at the last fitted row; the trajectory's own where the filter failed."""
+        last = self.rows.fitted - 1
+        if self.ok:
+            return np.asarray(self._filtered[1].filtered_means[last])
+        part = slice(self.recording * self.stepper.problem.state, (self.recording + 1) * self.stepper.problem.state)
+        return np.asarray(self._run(self.estimate.z[part], slice(0, last + 1))[1][-1])
+
+    @cached_property
+    def readings(self) -> Float[np.ndarray, "time channel"]:
+        """Filtered readings over the fitted rows, then the free run."""
+        last = self.rows.fitted - 1
+        run = np.asarray(self._run(self.last_state, slice(last, len(self.rows.times)))[0])
+        return np.concatenate([self.followed[:last], run])
+
+    @cached_property
+    def followed(self) -> Float[np.ndarray, "fitted channel"]:
+        """Readings of the filtered phase points over the fitted rows."""
+        means = np.asarray(self._filtered[1].filtered_means[: self.rows.fitted])
+        return self.along(self.stepper.problem.equations.readings, means)
+
+    def along(self, function: Callable[[Any], Any], states: Float[np.ndarray, "row state"]) -> np.ndarray:
+        """One of the compiled equations at phase points of the leading rows."""
+        p, n = self.stepper.problem, len(states)
+        coefficients = p.coefficients(self.recording, self.estimate.z, self.estimate.combination)
+        fixed = (np.broadcast_to(v, (n, len(v))) for v in (p.parameter_values(self.estimate.z), coefficients))
+        values, last = fixed
+        parts = [states, values, self.rows.inputs[:n], self.rows.times[:n, None], last]
+        return np.asarray(jax.vmap(function)(jnp.asarray(np.concatenate(parts, axis=1))))
+
+    @cached_property
+    def innovations(self) -> Float[np.ndarray, "fitted channel"]:
+        """Standardised innovations of the fitted rows."""
+        return np.asarray(self._filtered[1].standardised_innovations[: self.rows.fitted])
+
+    def held_out_errors(self, times: np.ndarray, readings: np.ndarray) -> Float[np.ndarray, "row channel"]:
+        """Readings minus the free run at original times after the last fitted row; NaN where nothing was read."""
+        run = self.readings[self.rows.fitted - 1 :]
+        return readings - CubicSpline(self.rows.times[self.rows.fitted - 1 :], run)(times) if len(run) > 3 else (
+            readings - np.stack([np.interp(times, self.rows.times[self.rows.fitted - 1 :], c) for c in run.T], axis=1)
+        )
+
+    def held_out_log_density(self) -> float:
+        """Sum over held-out rows of the log density of each reading around the free run, with the filter's spread."""
+        first = self.rows.fitted
+        weight = self._roots()[first:] ** 2
+        S = np.asarray(self._filtered[1].innovation_covariances[first:])
+        variance = np.diagonal(S, axis1=1, axis2=2) / weight
+        error = self.rows.readings[first:] - self.readings[first:]
+        seen = ~np.isnan(error)
+        terms = -0.5 * (np.log(2 * np.pi * variance) + np.where(seen, error, 0.0) ** 2 / variance)
+        return float(terms[seen].sum())
+
+    def _roots(self) -> np.ndarray:
+        return row_roots(self.stepper.problem, self.recording, len(self.rows.times), colour_ratio(self.estimate))
+
+    def missing_force(self) -> Float[np.ndarray, "fitted coordinate"]:
+        """Smoothed missing force on every momentum, in units of dp/dt, by fitted row (the last span's twice)."""
+        d, n = self.stepper.problem.equations.dim, self.rows.fitted
+        xi = np.asarray(self.smoothed.disturbances[: n - 1, d:])
+        force = xi / np.diff(self.rows.times[:n])[:, None]
+        return np.concatenate([force, force[-1:]])
+
+    def strain(self) -> Float[np.ndarray, "fitted coordinate"]:
+        """Standardised smoothed disturbances of every momentum."""
+        d, n = self.stepper.problem.equations.dim, self.rows.fitted
+        series = np.asarray(self.smoothed.standardised_disturbances[: n - 1, d:])
+        return np.concatenate([series, series[-1:]])
+
+    def _run(self, x: np.ndarray, rows: slice) -> Any:
+        p, e = self.stepper.problem, self.estimate
+        return free_run(p, self.stepper.courses[self.recording], e.z, e.combination, self.recording, x, rows)
+

@@ -1,0 +1,99 @@
+"""From evidences to probabilities: the contract's prior, the price of a combination, tempering under misfit."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .._effects import prices
+from ._problem import Combination, Problem
+from ._search import Found
+from ._weighed import Estimate
+
+# A coefficient whose posterior is as wide as this share of its prior has learnt nothing from the recording.
+_UNINFORMED = 0.7
+# Kinds of remainder other than white noise; each combination divides its remainder's prior among them.
+_REMAINDERS = ("coloured", "force")
+# Inflation below this is what whitened rows show by chance.
+_CHANCE = 1.7
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """A combination with its posterior probability and the estimate that speaks for it."""
+
+    combination: Combination
+    probability: float
+    log_evidence: float  # over kinds of remainder, tempered, prior of the combination not included
+    best: Estimate
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Probabilities of everything that was weighed.
+
+    `as_it_is` is the probability of the simulation with nothing left out, `unexplained` that of a remainder without
+    a name; `named` holds the combinations, likeliest first. They add up to one. `tempered` is the factor by which log
+    evidences were shrunk because the remainder is not white on the scale of the motion.
+    """
+
+    as_it_is: float
+    unexplained: float
+    named: tuple[Weighed, ...]
+    nothing: Estimate  # the best estimate without effects
+    evidences: dict[Combination, float]  # tempered log evidence of everything fitted, nothing (best kind) included
+    tempered: float
+
+
+def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
+    """Weigh every combination by evidence and the contract's prior (section 4)."""
+    candidates = [problem.equations.candidates[i] for i in problem.searched]
+    families = sorted({c.effect.family for c in candidates} | {"any"})
+    price = {problem.searched[i]: p for i, p in prices(candidates, families).items()}
+    remainder = 1.0 / len(families)
+    factor = 1.0 / inflation if inflation > _CHANCE else 1.0
+    top = max(e.log_evidence for es in found.estimates.values() for e in es)
+    white, other, named = -np.inf, -np.inf, []
+    evidences: dict[Combination, float] = {}
+    for combination, estimates in found.estimates.items():
+        tempered = {e.kind: top + factor * (e.log_evidence - top) for e in estimates}
+        plain = tempered.get("white", -np.inf)
+        noisy = _mixture([tempered.get(kind, -np.inf) for kind in _REMAINDERS])
+        total = float(np.logaddexp(plain, np.log(remainder) + noisy))
+        evidences[combination] = total if combination else max(plain, noisy)
+        if not combination:
+            white, other = plain, noisy
+        elif _informed(problem, found, combination):
+            weight = float(np.log([price[c] for c in combination]).sum())
+            named.append((combination, weight, total, max(estimates, key=lambda e: e.log_evidence)))
+    logs = np.array([white, np.log(remainder) + other, *(w + total for _, w, total, _ in named)])
+    probability = np.exp(logs - logs.max())
+    probability /= probability.sum()
+    ranked = sorted(zip(named, probability[2:], strict=True), key=lambda pair: -pair[1])
+    return Posterior(
+        as_it_is=float(probability[0]),
+        unexplained=float(probability[1]),
+        named=tuple(Weighed(c, float(p), float(total), best) for (c, _, total, best), p in ranked),
+        nothing=max(found.estimates[()], key=lambda e: e.log_evidence),
+        evidences=evidences,
+        tempered=factor,
+    )
+
+
+def _mixture(values: Sequence[float]) -> float:
+    """Log of the mean of exponentials."""
+    values = np.array(values)
+    top = values.max()
+    return float(top + np.log(np.mean(np.exp(values - top)))) if np.isfinite(top) else -np.inf
+
+
+def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
+    """Whether the recording says anything about every coefficient of a combination.
+
+    An effect that calibration owns already (a stiffness beside a free stiffness) changes nothing, and its
+    posterior is its prior; weighing it would only dilute the others.
+    """
+    best = max(found.estimates[combination], key=lambda e: e.log_evidence)
+    first = problem.head + problem.calibrated.size
+    sd = np.sqrt(np.diag(best.covariance)[first : first + len(combination)])
+    return bool(np.isfinite(best.log_evidence)) and bool((sd < _UNINFORMED * found.priors.scales[list(combination)]).all())

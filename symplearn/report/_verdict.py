@@ -1,0 +1,40 @@
+"""The verdict, its place and its times in plain sentences."""
+
+from typing import Any
+
+from ..diagnosis._record import Diagnosis
+from ._units import time_unit
+from ._words import combination, number, plain, probability
+
+PROBLEM = "The fit did not converge: the numbers here are where it stopped, not an answer to rely on."
+
+
+def verdict_sentence(diagnosis: Diagnosis) -> str:
+    """One sentence with the probability of the reported combination."""
+    document = diagnosis.document
+    chance = f"probability {probability(document['probability'])}"
+    if document["verdict"] == "consistent" and document["probability"] < 0.5:
+        return (
+            f"The recording rules out neither the simulation as it is nor that it lacks something ({chance})."
+        )
+    if document["verdict"] == "consistent":
+        return f"The simulation agrees with the recording; nothing needs to be added ({chance})."
+    if document["verdict"] == "unexplained":
+        return f"The simulation and the recording differ, and no effect with a name explains it ({chance})."
+    return f"The simulation left something out: {combination(document['findings'])} ({chance})."
+
+
+def where_and_when(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+    """Pairs of a word and what it says: where it lives, on what, in which recordings, and when."""
+    place, count = diagnosis.document["location"], len(diagnosis.series)
+    lines = [("Part", plain(place["kind"])), ("On", ", ".join(map(plain, place["targets"])))]
+    if count > 1:
+        lines.append(("Recordings", ", ".join(str(r) for r in place["recordings"])))
+    lines.append(("Time", "; ".join(_window(window, diagnosis) for window in place["time_windows"])))
+    return [(word, says) for word, says in lines if says]
+
+
+def _window(window: list[Any], diagnosis: Diagnosis) -> str:
+    unit = time_unit(diagnosis)
+    span = f"{number(window[0])} to {number(window[1])}" + (f" {plain(unit)}" if unit else "")
+    return f"{span} in recording {int(window[2])}" if len(window) > 2 else span

@@ -1,0 +1,76 @@
+"""Forecasts continue the path, and what comes lies in the stated interval as often as stated."""
+
+import equinox as eqx
+import estimation_cases as cases
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from symplearn._errors import InputError
+from symplearn._fit import Estimate
+from symplearn._forecast import forecast
+from symplearn._objectives import MarginalLikelihood, TimeSeries
+from symplearn._prior import Flat, Prior
+
+N, AHEAD = 12, 6
+
+
+def estimated(ys):
+    """An estimate at the truth: what is tested is the forecast, not the fit."""
+    model = cases.as_model(*cases.linear_system())
+    series = TimeSeries(jnp.arange(float(N)), jnp.asarray(ys))
+    return Estimate(model, series, MarginalLikelihood(), Prior(Flat()), 0.0, 0.0, 0.0, 0.0, True, 0)
+
+
+def recorded(seed):
+    system = cases.linear_system()
+    return cases.simulate(*system, N + AHEAD, np.random.default_rng(seed))[1]
+
+
+def test_the_forecast_is_the_kalman_predictor():
+    """On a linear model, means and covariances are those of the last filtered moments pushed forward."""
+    A, H, Q, R, m0, P0 = cases.linear_system()
+    ys = recorded(0)
+    _, m, P = cases.kalman_log_likelihood(A, H, Q, R, m0, P0, ys[:N])
+    ahead = forecast(estimated(ys[:N]), until=N - 1.0 + AHEAD)
+    assert np.array_equal(ahead.times, np.arange(N, N + AHEAD))
+    for k in range(AHEAD):
+        m, P = A @ m, A @ P @ A.T + Q
+        np.testing.assert_allclose(ahead.state_means[k], m, atol=1e-12)
+        np.testing.assert_allclose(ahead.state_covariances[k], P, atol=1e-12)
+        np.testing.assert_allclose(ahead.sds[k], np.sqrt(np.diagonal(H @ P @ H.T + R)), atol=1e-12)
+        # A linear model has no spread to shift the mean.
+        np.testing.assert_allclose(ahead.path[k], H @ m, atol=1e-12)
+    assert "Forecast of 6 readings from 12 to 17" in str(ahead)
+
+
+def test_what_comes_is_covered():
+    """Over 150 recordings, 95 % of the readings to come are within 1.96 sd of the forecast mean."""
+    inside = []
+    for seed in range(150):
+        ys = recorded(seed)
+        ahead = forecast(estimated(ys[:N]), until=N - 1.0 + AHEAD)
+        inside.append(np.mean(np.abs(ys[N:] - ahead.means) < 1.96 * ahead.sds))
+    # Recordings are independent, readings within one are not.
+    error = np.std(inside) / 150**0.5
+    assert abs(np.mean(inside) - 0.95) < 4 * error and error < 0.01
+
+
+def test_times_of_ones_own_may_be_asked():
+    """Given times are forecast as they are; a half interval of a discrete map is still one application."""
+    ahead = forecast(estimated(recorded(0)[:N]), times=[N + 1.0, N + 3.0])
+    assert np.array_equal(ahead.times, [N + 1.0, N + 3.0])
+
+
+def test_bad_requests_are_refused():
+    """Both or neither of `until` and `times`, times in the past, and a model that escapes are refused."""
+    estimate = estimated(recorded(0)[:N])
+    for request in ({}, {"until": 20.0, "times": [20.0]}):
+        with pytest.raises(InputError, match="either `until` or `times`"):
+            forecast(estimate, **request)
+    for request in ({"until": 3.0}, {"times": [3.0, 20.0]}, {"times": []}):
+        with pytest.raises(InputError, match="after the recording's last"):
+            forecast(estimate, **request)
+    growing = eqx.tree_at(lambda e: e.model.dynamics.A, estimate, 1e80 * jnp.eye(3))
+    with pytest.raises(InputError, match="not finite"):
+        forecast(growing, until=N - 1.0 + AHEAD)

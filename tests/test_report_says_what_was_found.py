@@ -1,0 +1,307 @@
+"""The page and the lines for the terminal say what the document says, to anyone, offline, and obey no file."""
+
+import dataclasses
+import html
+import io
+import re
+
+import numpy as np
+import pytest
+import report_cases as cases
+from rich.console import Console
+
+from symplearn._effects import EFFECTS
+from symplearn.report import html_report, summary
+from symplearn.report._decimate import envelope
+from symplearn.report._equation import parts
+from symplearn.report._law import added_force
+from symplearn.report._motion import channel, close_up_window
+from symplearn.report._panel import limits
+from symplearn.report._units import coefficient_unit
+
+ATTACK = "<script>alert('x')</script>\"onload=\"$\\frac{1}{0}$ [red]{{7*7}}\u202e"
+
+
+@pytest.fixture(scope="module")
+def page():
+    """The report of the damped pendulum."""
+    return html_report(cases.damped_pendulum(forecast=cases.forecast()))
+
+
+def text_of(page, section=None):
+    """What a reader sees, without tags, of a section or of all."""
+    if section:
+        page = re.search(rf'<section id="{section}">.*?</section>', page, re.DOTALL).group()
+    page = re.sub(r"<(style|title)>.*?</\1>", "", page, flags=re.DOTALL)
+    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", page)).split())
+
+
+def rows_of(page, section):
+    """Cells of the tables of a section."""
+    page = re.search(rf'<section id="{section}">.*?</section>', page, re.DOTALL).group()
+    rows = re.findall(r"<tr>(.*?)</tr>", page, re.DOTALL)
+    return [[html.unescape(cell) for cell in re.findall(r"<t[dh]>(.*?)</t[dh]>", row)] for row in rows]
+
+
+def printed(diagnosis, path, **options):
+    """The lines of the terminal."""
+    file = io.StringIO()
+    Console(file=file, width=300, **options).print(summary(diagnosis, path))
+    return file.getvalue()
+
+
+def test_sections_come_in_order(page):
+    """Verdict first; then where, what, equations, pictures, numbers, the remainder, and what to record next."""
+    order = ["where", "findings", "equations", "pictures", "numbers", "remains", "next"]
+    assert re.findall(r'<section id="(\w+)">', page) == order
+    verdict = "The simulation left something out: viscous damping on theta (probability 93.1 %)."
+    assert 0 < page.index(verdict) < page.index('<section id="where">')
+
+
+def test_numbers_are_those_of_the_document(page):
+    """Each number of the fit, the parameters and the coefficients is the document's, to the digits shown."""
+    document = cases.document()
+    rows = {row[0]: row[1:] for row in rows_of(page, "numbers")}
+    fits = [document["fit"][when] for when in ("before", "after")]
+    expected = {
+        "Held-out rmse, angle_deg [°]": [fit["holdout_rmse"]["angle_deg"] for fit in fits],
+        "Held-out log density [nats]": [fit["holdout_log_density"] for fit in fits],
+        "Process noise, p": [fit["process_noise_sd"]["p"] for fit in fits],
+        "Reading noise, angle_deg [°]": [fit["noise_sd"]["angle_deg"] for fit in fits],
+        "F": [document["parameters"][when]["F"]["mean"] for when in ("before", "after")],
+    }
+    for name, values in expected.items():
+        shown = [float(cell.split(" ± ")[0]) for cell in rows[name][:2]]
+        # Four significant digits: half a unit in the fourth is at most 5e-4 of the number.
+        assert shown == pytest.approx(values, rel=5e-4)
+    assert float(rows["Held-out rmse, angle_deg [°]"][2]) == pytest.approx(14.532 / 0.61234, rel=5e-3)
+    name, mean, sd, ends, unit = rows_of(page, "findings")[1]
+    assert (name, float(mean)) == ("c", pytest.approx(0.00090321, rel=5e-4))
+    assert float(sd) == pytest.approx(0.0000213, rel=5e-2)
+    assert [float(end) for end in ends.split(" to ")] == [0.00086, 0.00094]
+    assert unit == "(kg m²/s)/rad"
+    assert cases.SENTENCE in text_of(page, "findings")
+
+
+def test_every_alternative_is_listed(page):
+    """The table of what was weighed has the reported one, every alternative, and the rest."""
+    assert rows_of(page, "remains")[1:] == [
+        ["viscous damping on theta (reported)", "93.1 %"],
+        ["quadratic drag on theta with coulomb friction on theta", "5.12 %"],
+        ["something without a name (process noise alone)", "1.01 %"],
+        ["nothing left out", "less than 0.1 %"],
+        ["all other combinations together", "0.75 %"],
+    ]
+
+
+def test_equations_stand_whole_and_only_the_new_is_marked(page):
+    """Both equations are there letter by letter, and the marked letters are exactly the added term."""
+    record = cases.damped_pendulum()
+    codes = [html.unescape(re.sub(r"</?mark>", "", code)) for code in re.findall(r"<code>(.*?)</code>", page)]
+    assert codes == [*record.equation_before, *record.equation_after]
+    assert re.findall(r"<mark>(.*?)</mark>", page) == [" - 0.0009032*p/J"]
+
+
+def test_parts_of_an_equation_are_the_equation():
+    """Whatever is marked, the parts put together are the new equation, of any length."""
+    long = " + ".join(f"k*x**{n}" for n in range(2000))
+    for old, now in [
+        ("", "a"),
+        ("a*b", "a*b"),
+        ("x + y", "c*x + y - 2.5e-3*z"),
+        (long, long + "-f"),
+        ("a", ""),
+    ]:
+        cut = parts(old, now)
+        assert "".join(part.text for part in cut) == now
+        assert any(part.new for part in cut) == (now not in (old, ""))
+
+
+def test_the_page_needs_nothing_else(page):
+    """No address, no script, no link, no import: pictures are inside, and the page forbids itself the rest."""
+    assert not re.search(r"https?:|<script|<link|<iframe|@import|url\(|\son\w+=", page, re.IGNORECASE)
+    assert set(re.findall(r'src="([^,]*),', page)) == {"data:image/png;base64"}
+    assert "default-src 'none'" in page
+
+
+def test_texts_of_files_are_only_texts(tmp_path):
+    """A title, column, coordinate, unit, recording or sentence made to break out is shown, not obeyed."""
+    record = hostile()
+    page = html_report(record)
+    assert "<script" not in page.lower() and "\u202e" not in page
+    assert not re.search(r"<[^>]*onload=\"\$", page)
+    assert text_of(page).count("<script>alert('x')</script>") >= 8
+    assert "{{7*7}}" in text_of(page)
+    lines = printed(record, tmp_path, force_terminal=True, color_system="truecolor")
+    assert "[red]" in lines and "\\u202e" in lines and "\x1b]0;" not in lines
+
+
+def hostile():
+    """The damped pendulum with hostile words in every text that comes from a file."""
+    answer = cases.document()
+    answer["location"] |= {"where": ATTACK, "targets": [ATTACK]}
+    answer["findings"][0] |= {
+        "sentence": ATTACK + "\x1b]0;owned\x07",
+        "target": ATTACK,
+        "effect": "sensor_bias",
+    }
+    answer["warnings"] = [ATTACK]
+    answer["next_measurement"] = ATTACK
+    for fit in answer["fit"].values():
+        fit |= {"holdout_rmse": {ATTACK: 1.0}, "noise_sd": {ATTACK: 1.0}}
+    one = dataclasses.replace(cases.series(rows=60, end=4.0), name=ATTACK)
+    return cases.damped_pendulum(
+        title=ATTACK,
+        document=answer,
+        columns=(ATTACK,),
+        coordinates=("theta",),
+        units={ATTACK: ATTACK, "t": ATTACK, "theta": ATTACK},
+        equation_before=(ATTACK,),
+        equation_after=(ATTACK + " + b",),
+        series=(one, one),
+    )
+
+
+def test_consistent_is_said_calmly(tmp_path):
+    """Where nothing was left out, the page says so, has no findings, no before and after, and dashes for null."""
+    record = cases.consistent()
+    page = html_report(record)
+    assert "The simulation agrees with the recording; nothing needs to be added (probability 98.8 %)." in page
+    assert 'id="findings"' not in page and "<mark>" not in page
+    assert "After" not in text_of(page, "numbers")
+    assert ["Held-out rmse, angle_deg [°]", "–"] in rows_of(page, "numbers")
+    assert "None" not in text_of(page) and "nan" not in text_of(page).lower()
+    lines = printed(record, tmp_path)
+    assert "nothing needs to be added" in lines and "->" not in lines
+
+
+def test_an_unlikely_consistent_does_not_claim_agreement():
+    """Where nothing left out is merely not ruled out, the sentence does not say that all is well."""
+    record = cases.consistent()
+    record.document["probability"] = 0.08
+    assert "rules out neither" in html_report(dataclasses.replace(record, series=()))
+
+
+def test_unexplained_names_nothing():
+    """Where no effect has the better of it, the page says that none does."""
+    answer = cases.document() | {"verdict": "unexplained", "findings": []}
+    page = html_report(cases.damped_pendulum(document=answer, series=()))
+    assert "no effect with a name explains it (probability 93.1 %)" in page
+    assert "No effect with a name explains the difference" in text_of(page, "findings")
+    assert "process noise alone) (reported)" in text_of(page, "remains")
+
+
+def test_a_fit_that_did_not_converge_is_said_first(tmp_path):
+    """Neither page nor terminal shows a failed fit as a success."""
+    answer = cases.document() | {"converged": False}
+    record = cases.damped_pendulum(document=answer, series=())
+    page = html_report(record)
+    assert page.index("did not converge") < page.index('<section id="where">')
+    assert "did not converge" in printed(record, tmp_path).splitlines()[1]
+
+
+def test_eight_long_recordings_stay_small():
+    """Eight recordings of 20,000 rows and five columns make a page below 2 MB that says what it does not draw."""
+    one = cases.series(rows=20_000, end=200.0, columns=5)
+    record = cases.damped_pendulum(series=(one,) * 8, columns=tuple(f"column{i}" for i in range(5)))
+    page = html_report(record)
+    assert len(page.encode()) < 2_000_000
+    assert "Pictures are of the first 6 of 8 recordings." in page
+    assert "Pictures are of the first 3 of 5 columns." in page
+    headings = re.findall(r"<h3>(column\d), recording (\d)", page)
+    assert {int(number) for _, number in headings} == set(range(1, 7))
+
+
+def test_a_simulation_that_diverges_is_still_drawn():
+    """Values without end, gaps and infinities break no picture and stretch no axis by more than twice its range."""
+    one = cases.series(rows=120, end=6.0)
+    for bad in (1e200, 1e308, np.inf, np.nan):
+        one.before[100:] = bad
+        one.force_before[:] = bad
+        page = html_report(cases.damped_pendulum(series=(one,)))
+        assert page.count("<img") >= 4
+        low, high = limits(one.readings, one.before)
+        size = np.nanmax(one.readings) - np.nanmin(one.readings)
+        # One size on either side at most, and a margin of 6 % of the three.
+        assert high - low < 3 * size * 1.13
+
+
+def test_an_envelope_covers_the_line():
+    """Of 20,001 values the envelope keeps each stretch's extremes, in order, and a gap stays a gap."""
+    values = np.random.default_rng(0).normal(size=20_001)
+    values[5000:8000] = np.nan
+    kept = envelope(values, 100)
+    assert len(kept) <= 202 and np.all(np.diff(kept) > 0)
+    for stretch in np.array_split(values, 100):
+        if np.isfinite(stretch).any():
+            assert np.isin([np.nanmin(stretch), np.nanmax(stretch)], values[kept]).all()
+    assert np.isnan(values[kept]).any()
+
+
+def test_the_close_up_shows_ten_cycles():
+    """The close-up of a cosine spans its last ten periods, and lies in the held-out part."""
+    one = channel(cases.damped_pendulum(), cases.series(rows=4000), "angle_deg")
+    wave = np.cos(2 * np.pi * 7 * one.times)
+    first, last = close_up_window(dataclasses.replace(one, after=wave, boundary=15.0))
+    assert last == 20.0 and first >= 15.0
+    # Ten periods to the last rise, and less than one after it.
+    assert 10 / 7 <= last - first <= 11 / 7 + 0.01
+
+
+def test_the_drawn_law_is_the_contract_s():
+    """The force drawn for each effect is the formula of the contract, written out here by hand."""
+    q, v, c = np.linspace(-1, 1, 7), np.linspace(2, -3, 7), 0.4
+    by_hand = {
+        "viscous_damping": -c * v,
+        "quadratic_drag": -c * np.abs(v) * v,
+        "coulomb_friction": -c * np.sign(v),
+        "constant_force": c + 0 * q,
+        "linear_stiffness": -c * q,
+        "quadratic_stiffness": -c * q**2,
+        "cubic_stiffness": -c * q**3,
+    }
+    for effect, force in by_hand.items():
+        finding = {
+            "effect": effect,
+            "target": "x",
+            "recordings": [2],
+            "coefficients": {EFFECTS[effect].coefficient: {"mean": c}},
+        }
+        # Same arithmetic in another order: a few units in the last place.
+        np.testing.assert_allclose(added_force([finding], "x", q, v, 2), force, rtol=1e-15, atol=1e-15)
+        assert added_force([finding], "x", q, v, 1) is None
+        assert added_force([finding], "y", q, v, 2) is None
+
+
+def test_units_of_coefficients_follow_from_the_law():
+    """With p in kg m/s, q in m, t in s: c of drag is kg/m; here in letters, and nothing where a unit is unknown."""
+    record = cases.damped_pendulum(units={"theta": "m", "p": "N", "t": "s", "angle_deg": "V"})
+    expected = {
+        "viscous_damping": "N/m",
+        "quadratic_drag": "N·s/m²",
+        "coulomb_friction": "N/s",
+        "constant_force": "N/s",
+        "linear_stiffness": "N/(m·s)",
+        "cubic_stiffness": "N/(m³·s)",
+    }
+    for effect, unit in expected.items():
+        assert coefficient_unit({"effect": effect, "target": "theta"}, record) == unit
+    assert coefficient_unit({"effect": "sensor_bias", "target": "angle_deg"}, record) == "V"
+    assert coefficient_unit({"effect": "sensor_gain", "target": "angle_deg"}, record) is None
+    unknown = dataclasses.replace(record, units={"theta": "m"})
+    assert coefficient_unit({"effect": "viscous_damping", "target": "theta"}, unknown) is None
+
+
+def test_the_terminal_says_it_in_a_few_plain_lines(tmp_path):
+    """Verdict, sentence, held-out rmse with its factor, what to record, warnings, report; no colour codes in a file."""
+    answer = cases.document() | {"warnings": ["thinned from 4000 rows"]}
+    lines = printed(cases.damped_pendulum(document=answer), tmp_path).splitlines()
+    assert lines == [
+        "The simulation left something out: viscous damping on theta (probability 93.1 %).",
+        f"Where: {answer['location']['where']}",
+        f"  * {cases.SENTENCE}",
+        "Held-out rmse of angle_deg: 14.5 -> 0.612 ° (23.7 times smaller)",
+        f"Record next: {answer['next_measurement']}",
+        "Warning: thinned from 4000 rows",
+        f"Report: {tmp_path / 'report.html'}",
+    ]
