@@ -16,7 +16,7 @@ test: $(VENV)/project.stamp ## linter, formatter, types, and every test of secon
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
-	$(VENV)/bin/pytest -m "not slow"
+	$(VENV)/bin/pytest -m "not slow" -n 2 --dist loadfile
 
 test-slow: $(VENV)/project.stamp ## the tests of minutes
 	$(VENV)/bin/pytest -m slow

@@ -1,7 +1,6 @@
 """Explicit symplectic methods by splitting, and their symmetric compositions."""
 
 import abc
-from typing import cast
 
 import equinox as eqx
 import jax
@@ -214,7 +213,7 @@ class Composition(AbstractIntegrator):
             start, weight = part
             return self.base.flow(hamiltonian, state, t + start * dt, weight * dt), None
 
-        return cast(Array, jax.lax.scan(stage, state, (starts, weights))[0])
+        return jax.lax.scan(stage, state, (starts, weights))[0]
 
 
 def yoshida4(base: AbstractIntegrator) -> Composition:

@@ -120,7 +120,7 @@ class SimulatedHamiltonian(ig.AbstractHamiltonian):
     def slope(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
         return self.equations.slope(self.arguments(q, p))
 
-    def at(self, t: Float[Array, ""]) -> "SimulatedHamiltonian":
+    def at(self, t: Float[Array, ""] | float) -> "SimulatedHamiltonian":
         return SimulatedHamiltonian(self.equations, self.parameters, self.inputs, jnp.asarray(t), self.coefficients)
 
     def kick(
@@ -201,6 +201,4 @@ class SimulatedReading(eqx.Module):
         self, x: Float[Array, " state"], context: tuple[Float[Array, ""], Float[Array, " input"]]
     ) -> Float[Array, " channel"]:
         t, inputs = context
-        return self.equations.readings(
-            jnp.concatenate([x, self.parameters, inputs, t[None], self.coefficients])
-        )
+        return self.equations.readings(jnp.concatenate([x, self.parameters, inputs, t[None], self.coefficients]))

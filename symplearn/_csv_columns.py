@@ -75,7 +75,7 @@ def read_columns(
 def _opened(path: str | Path) -> io.TextIOWrapper:
     # Foreign bytes outside the used columns do no harm, so they are carried along instead of refused.
     binary = gzip.open(path, "rb") if str(path).endswith(".gz") else open(path, "rb")
-    return io.TextIOWrapper(binary, encoding="utf-8-sig", errors="surrogateescape", newline="")  # type: ignore[arg-type]
+    return io.TextIOWrapper(binary, encoding="utf-8-sig", errors="surrogateescape", newline="")
 
 
 class _Reader:

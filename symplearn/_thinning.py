@@ -53,9 +53,7 @@ def thinning_width(times: Float[np.ndarray, " time"], readings: Float[np.ndarray
     return width if width > 2 * span / len(times) else 0.0
 
 
-def thin(
-    times: Float[np.ndarray, " time"], readings: Float[np.ndarray, "time channel"], width: float
-) -> Thinned:
+def thin(times: Float[np.ndarray, " time"], readings: Float[np.ndarray, "time channel"], width: float) -> Thinned:
     """Average the readings over bins of `width`, corrected for the motion's slope and curvature inside a bin.
 
     The mean over a bin differs from the value at its mean time by curvature times the variance of the times over 2.

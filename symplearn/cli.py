@@ -2,6 +2,7 @@
 
 import os
 import sys
+import tempfile
 import time
 from importlib import resources
 from pathlib import Path
@@ -20,6 +21,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+_CORES = os.cpu_count() or 1
 _Positive = Annotated[int, typer.Option(min=1, help="Threads; the answer does not depend on it.")]
 
 
@@ -34,22 +36,24 @@ def diagnose(
     forecast_step: Annotated[float | None, typer.Option(help="Spacing of the forecast.")] = None,
     effects: Annotated[str | None, typer.Option(help="Search these effects only (comma separated).")] = None,
     sensor_only: Annotated[bool, typer.Option("--sensor-only", help="Search effects of the sensors only.")] = False,
-    dynamics_only: Annotated[bool, typer.Option("--dynamics-only", help="Search effects of the dynamics only.")] = False,
-    jobs: _Positive = os.cpu_count() or 1,
+    dynamics_only: Annotated[
+        bool, typer.Option("--dynamics-only", help="Search effects of the dynamics only.")
+    ] = False,
+    jobs: _Positive = _CORES,
     time_limit: Annotated[float | None, typer.Option(help="Cut the search short after these seconds.")] = None,
     fail_on_mismatch: Annotated[
         bool, typer.Option("--fail-on-mismatch", help="Exit with 3 unless the verdict is `consistent`.")
     ] = False,
     cache: Annotated[bool, typer.Option(help="Keep compiled programs under the user's cache folder.")] = True,
 ) -> None:
-    """Locate what differs between SIMULATION and RECORDINGS, name what was left out and show the fit without and with it."""
+    """Locate what differs, name what was left out, and show the fit without and with it."""
     if not 0 <= holdout < 1:
         raise InputError(f"--holdout: is {holdout}; give a share from 0 up to, but not including, 1")
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"--time-limit: is {time_limit}; give a positive number of seconds")
     if forecast_step is not None and forecast_until is None:
         raise InputError("--forecast-step: needs --forecast-until; give the time to forecast to")
-    _prepare_jax(cache)
+    _prepare(cache)
     from ._recording import read_recordings
     from ._simulation_file import read_simulation
     from .diagnosis import Options, restriction_of
@@ -77,7 +81,8 @@ def diagnose(
         )
         progress.say("writing the report")
         write_outputs(found, folder)
-    Console().print(summary(found, folder))
+    console = Console()
+    console.print(summary(found, folder), soft_wrap=not console.is_terminal)
     if fail_on_mismatch and found.document["verdict"] != "consistent":
         raise typer.Exit(3)
 
@@ -119,22 +124,32 @@ class _Progress:
             self._console.print(f"{passed:6.1f} s  {message}", markup=False, highlight=False)
 
 
-def _prepare_jax(cache: bool) -> None:
-    """Double precision, and compiled programs kept in a private folder of the user's cache."""
+def _prepare(cache: bool) -> None:
+    """Double precision; compiled programs and the plots' font list in a private folder of the user's cache."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    if not cache:
-        return
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "symplearn" / "jax"
+    folder = _private_folder() if cache else None
+    # Left to itself matplotlib keeps its font list in a folder of its own.
+    fonts = str(folder / "matplotlib") if folder else tempfile.mkdtemp(prefix="symplearn-")
+    os.environ.setdefault("MPLCONFIGDIR", fonts)
+    if folder is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def _private_folder() -> Path | None:
+    """The cache folder, readable by its owner alone; None where there can be none: what lies in it is executed."""
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "symplearn"
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        folder.parent.chmod(0o700)
-        folder.chmod(0o700)
+        for part in (folder, folder / "jax", folder / "matplotlib"):
+            part.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if part.is_symlink() or part.stat().st_uid != os.getuid():
+                return None
+            part.chmod(0o700)
     except OSError:
-        return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+        return None
+    return folder
 
 
 def main() -> None:

@@ -26,7 +26,7 @@ def refuse(constant):
 
 
 def test_json_is_the_document(tmp_path):
-    """diagnosis.json is strict JSON, has the document's keys in its order and the same numbers to the last bit."""
+    """diagnosis.json is strict JSON, the document's keys in its order and its numbers to the last bit."""
     record = cases.damped_pendulum()
     path = write_outputs(record, tmp_path)[0]
     answer = json.loads(path.read_text("utf-8"), parse_constant=refuse)
@@ -46,7 +46,7 @@ def test_a_nan_is_refused_before_anything_is_written(tmp_path):
 
 
 def test_forecast_is_exact(tmp_path):
-    """forecast.csv holds every number to the last bit, under the contract's names; what is not finite is empty."""
+    """forecast.csv has every number to the last bit, under the right names; no number is an empty cell."""
     forecast = cases.forecast()
     forecast.columns["angle_deg"]["before"][3] = np.inf
     written = write_outputs(cases.damped_pendulum(forecast=forecast), tmp_path)
@@ -79,7 +79,7 @@ def test_the_augmented_simulation_reads_back(tmp_path):
 
 @pytest.mark.parametrize("failing", [1, 2, 3, 4])
 def test_nothing_is_half_written(tmp_path, monkeypatch, failing):
-    """Where writing any of the four files fails, the files of the earlier run stand untouched, and no others."""
+    """Where writing any of the four files fails, the earlier run's files stand untouched, and no others."""
     write_outputs(cases.damped_pendulum(title="earlier", forecast=cases.forecast()), tmp_path)
     earlier = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
     later, calls = cases.damped_pendulum(forecast=cases.forecast()), []
@@ -123,7 +123,7 @@ def test_the_folder_is_made_and_left_empty(tmp_path):
 
 
 def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path):
-    """A file, a path through a file, a place where the system makes no folders: one sentence with the remedy."""
+    """A file, a path through a file, a place where nobody may write: one sentence with the remedy."""
     file = tmp_path / "file"
     file.write_text("mine")
     (tmp_path / "taken" / "report.html").mkdir(parents=True)

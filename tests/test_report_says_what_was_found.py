@@ -1,4 +1,4 @@
-"""The page and the lines for the terminal say what the document says, to anyone, offline, and obey no file."""
+"""The page and the lines for the terminal say what the document says, offline, and obey no file."""
 
 import dataclasses
 import html
@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 import report_cases as cases
+from PIL import Image
 from rich.console import Console
 
 from symplearn._effects import EFFECTS
@@ -15,7 +16,8 @@ from symplearn.report import html_report, summary
 from symplearn.report._decimate import envelope
 from symplearn.report._equation import parts
 from symplearn.report._law import added_force
-from symplearn.report._motion import channel, close_up_window
+from symplearn.report._motion import channel, close_up_window, motion_panels
+from symplearn.report._palette import AFTER, BEFORE, READING, SHADE
 from symplearn.report._panel import limits
 from symplearn.report._units import coefficient_unit
 
@@ -51,7 +53,7 @@ def printed(diagnosis, path, **options):
 
 
 def test_sections_come_in_order(page):
-    """Verdict first; then where, what, equations, pictures, numbers, the remainder, and what to record next."""
+    """Verdict first; then where, what, equations, pictures, numbers, remainder, what to record next."""
     order = ["where", "findings", "equations", "pictures", "numbers", "remains", "next"]
     assert re.findall(r'<section id="(\w+)">', page) == order
     verdict = "The simulation left something out: viscous damping on theta (probability 93.1 %)."
@@ -87,7 +89,7 @@ def test_every_alternative_is_listed(page):
     """The table of what was weighed has the reported one, every alternative, and the rest."""
     assert rows_of(page, "remains")[1:] == [
         ["viscous damping on theta (reported)", "93.1 %"],
-        ["quadratic drag on theta with coulomb friction on theta", "5.12 %"],
+        ["quadratic drag on theta, coulomb friction on theta", "5.12 %"],
         ["something without a name (process noise alone)", "1.01 %"],
         ["nothing left out", "less than 0.1 %"],
         ["all other combinations together", "0.75 %"],
@@ -118,7 +120,7 @@ def test_parts_of_an_equation_are_the_equation():
 
 
 def test_the_page_needs_nothing_else(page):
-    """No address, no script, no link, no import: pictures are inside, and the page forbids itself the rest."""
+    """No address, script, link or import: pictures are inside, and the page forbids itself the rest."""
     assert not re.search(r"https?:|<script|<link|<iframe|@import|url\(|\son\w+=", page, re.IGNORECASE)
     assert set(re.findall(r'src="([^,]*),', page)) == {"data:image/png;base64"}
     assert "default-src 'none'" in page
@@ -163,7 +165,7 @@ def hostile():
 
 
 def test_consistent_is_said_calmly(tmp_path):
-    """Where nothing was left out, the page says so, has no findings, no before and after, and dashes for null."""
+    """Where nothing was left out, the page says so, without findings or before and after; null is a dash."""
     record = cases.consistent()
     page = html_report(record)
     assert "The simulation agrees with the recording; nothing needs to be added (probability 98.8 %)." in page
@@ -201,7 +203,7 @@ def test_a_fit_that_did_not_converge_is_said_first(tmp_path):
 
 
 def test_eight_long_recordings_stay_small():
-    """Eight recordings of 20,000 rows and five columns make a page below 2 MB that says what it does not draw."""
+    """Eight recordings of 20,000 rows and five columns make less than 2 MB, and it says what is not drawn."""
     one = cases.series(rows=20_000, end=200.0, columns=5)
     record = cases.damped_pendulum(series=(one,) * 8, columns=tuple(f"column{i}" for i in range(5)))
     page = html_report(record)
@@ -213,17 +215,21 @@ def test_eight_long_recordings_stay_small():
 
 
 def test_a_simulation_that_diverges_is_still_drawn():
-    """Values without end, gaps and infinities break no picture and stretch no axis by more than twice its range."""
-    one = cases.series(rows=120, end=6.0)
-    for bad in (1e200, 1e308, np.inf, np.nan):
-        one.before[100:] = bad
-        one.force_before[:] = bad
-        page = html_report(cases.damped_pendulum(series=(one,)))
-        assert page.count("<img") >= 4
+    """Huge values and infinities break no picture and stretch no axis beyond three times its range."""
+    bad = (1e200, 1e308, np.inf, np.nan)
+    recordings = [cases.series(rows=120, end=6.0) for _ in bad]
+    for one, value in zip(recordings, bad, strict=True):
+        one.before[100:] = value
+        recordings[0].force_before[bad.index(value) :: 8] = value
+        recordings[0].velocity[bad.index(value) :: 9] = value
+        recordings[0].energy_before[bad.index(value) :: 9] = value
         low, high = limits(one.readings, one.before)
         size = np.nanmax(one.readings) - np.nanmin(one.readings)
         # One size on either side at most, and a margin of 6 % of the three.
         assert high - low < 3 * size * 1.13
+    page = html_report(cases.damped_pendulum(series=tuple(recordings)))
+    # Four of the first recording, two of each other, three of the force, one of the energy.
+    assert page.count("<img") == 4 + 6 + 3 + 1
 
 
 def test_an_envelope_covers_the_line():
@@ -274,7 +280,7 @@ def test_the_drawn_law_is_the_contract_s():
 
 
 def test_units_of_coefficients_follow_from_the_law():
-    """With p in kg m/s, q in m, t in s: c of drag is kg/m; here in letters, and nothing where a unit is unknown."""
+    """A force is p / t and a speed q / t; where a unit is unknown, nothing is said."""
     record = cases.damped_pendulum(units={"theta": "m", "p": "N", "t": "s", "angle_deg": "V"})
     expected = {
         "viscous_damping": "N/m",
@@ -293,7 +299,7 @@ def test_units_of_coefficients_follow_from_the_law():
 
 
 def test_the_terminal_says_it_in_a_few_plain_lines(tmp_path):
-    """Verdict, sentence, held-out rmse with its factor, what to record, warnings, report; no colour codes in a file."""
+    """Verdict, sentence, rmse with its factor, next recording, warnings, report; in a file no colours."""
     answer = cases.document() | {"warnings": ["thinned from 4000 rows"]}
     lines = printed(cases.damped_pendulum(document=answer), tmp_path).splitlines()
     assert lines == [
@@ -305,3 +311,25 @@ def test_the_terminal_says_it_in_a_few_plain_lines(tmp_path):
         "Warning: thinned from 4000 rows",
         f"Report: {tmp_path / 'report.html'}",
     ]
+
+
+def test_colours_in_pictures_are_true():
+    """Every colour of the legend stands in the picture of a long recording, within 3 of 255."""
+    one = channel(cases.damped_pendulum(), cases.series(rows=5000, end=100.0), "angle_deg")
+    image = Image.open(io.BytesIO(motion_panels(one, detail=False)[0].png)).convert("RGB")
+    seen = np.unique(np.asarray(image).reshape(-1, 3), axis=0).astype(int)
+    for colour in (BEFORE, AFTER, READING, SHADE, "#ffffff"):
+        asked = np.array(list(bytes.fromhex(colour[1:])))
+        # Pillow looks colours up in cells of 4 levels.
+        assert np.abs(seen - asked).max(axis=1).min() <= 3
+    assert [255, 255, 255] in seen.tolist()
+
+
+def test_very_short_recordings_are_drawn():
+    """One held-out row, or none at all and a single reading, make a page without a complaint."""
+    one = cases.series(rows=40, end=4.0)
+    short = dataclasses.replace(one, boundary=float(one.times[-2]))
+    rows = {name: getattr(one, name)[:1] for name in ("times", "readings", "before", "after")}
+    single = dataclasses.replace(one, boundary=0.0, **rows)
+    page = html_report(cases.damped_pendulum(series=(short, single)))
+    assert page.count("<img") == 4 + 2 + 3 + 1

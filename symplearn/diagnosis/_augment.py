@@ -9,7 +9,9 @@ from ._problem import Problem
 from ._weighed import Estimate
 
 
-def augmented(file: SimulationFile, problem: Problem, estimate: Estimate, coefficients: dict[int, float]) -> SimulationFile:
+def augmented(
+    file: SimulationFile, problem: Problem, estimate: Estimate, coefficients: dict[int, float]
+) -> SimulationFile:
     """Findings as `[[terms]]` with point values, merged with a term already there, and recalibrated parameters.
 
     A calibrated parameter keeps its bounds and gets its posterior as prior.

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 import sympy
 
@@ -64,14 +65,14 @@ def augmented_equations(file: SimulationFile) -> Equations:
         ) from None
     if file.integrator.name == "leapfrog" and not built.separable:
         raise InputError(
-            f"{file.name}: [integrator] name: leapfrog steps a separable Hamiltonian, T(p) + U(q), and this one is not; "
+            f"{file.name}: [integrator] name: leapfrog steps a separable Hamiltonian, T(p) + U(q), which this is not; "
             'use "tao" or "auto"'
         )
     return built
 
 
 def first_substep(file: SimulationFile, recordings: Sequence[Recording]) -> float:
-    """The longest substep to begin with: the file's own, or a fraction of the shortest period in the readings."""
+    """The longest substep to begin with: the file's own, or a fraction of the readings' shortest period."""
     if file.integrator.step is not None:
         return file.integrator.step
     span = max(r.times[-1] - r.times[0] for r in recordings)
@@ -109,7 +110,7 @@ def _integrator(file: SimulationFile, built: Equations, substep: float) -> ig.Ab
     """The file's symplectic method, composed to order four so that its error stays below what is looked for."""
     if file.integrator.name != "tao" and built.separable:
         return ig.suzuki4(ig.Leapfrog())
-    return ig.suzuki4(ig.Tao(omega=_BINDING / substep))
+    return ig.suzuki4(ig.Tao(omega=jnp.asarray(_BINDING / substep)))
 
 
 def _initial(file: SimulationFile) -> InitialPrior:

@@ -13,6 +13,8 @@ from ._trajectory import Predictions, Stepper
 THINNED = 1.177
 # An estimated noise never falls below this share of the readings' spread: readings repeat themselves exactly.
 _FLOOR = 1e-9
+# After this many steps a lane that lies this many nats behind the best is no longer improved.
+_PATIENCE, _HOPELESS = 6, 500.0
 
 
 @dataclass(frozen=True)
@@ -105,9 +107,9 @@ def calibrate(
     precision = np.stack([priors.precision_of(problem, c) for c in combinations])
     active = np.stack([problem.active(c) for c in combinations])
     fits = _evaluated(stepper, np.array(start, float), list(combinations), rows, weight)
-    damping, done = np.full(lanes, 1e-3), np.zeros(lanes, bool)
+    damping, done, hopeless = np.full(lanes, 1e-3), np.zeros(lanes, bool), np.zeros(lanes, bool)
     fits = _costed(problem, fits, weight, precision, priors.mean)
-    for _ in range(iterations):
+    for count in range(iterations):
         step = _steps(problem, fits, weight, precision, priors.mean, active, damping)
         trial_z = _bounded(problem, fits.z + np.where(done[:, None], 0.0, step))
         trial = _evaluated(stepper, trial_z, fits.combinations, rows, weight)
@@ -119,9 +121,19 @@ def calibrate(
         fits = _costed(problem, merged, weight, precision, priors.mean)
         damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-9, 1e12)
         done |= (better & (gain < tolerance)) | (damping > 1e8)
+        if count >= _PATIENCE:
+            value = fits.cost + 2 * _log_noise(problem, fits.noise, weight)
+            hopeless |= ~done & (value > np.nanmin(value) + 2 * _HOPELESS)
+            done |= hopeless
         if done.all():
             break
-    return replace(fits, converged=done & np.isfinite(fits.cost))
+    return replace(fits, converged=done & ~hopeless & np.isfinite(fits.cost))
+
+
+def _log_noise(problem: Problem, noise: np.ndarray, weight: list[np.ndarray]) -> np.ndarray:
+    """Sum over readings of the log noise, by lane."""
+    number = sum((w > 0).sum(0) for w in weight)
+    return (number * np.log(noise)).sum(1)
 
 
 def _evaluated(stepper, z, combinations, rows, weight) -> Fits:

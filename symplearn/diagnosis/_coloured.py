@@ -7,6 +7,7 @@ squares and the evidence follow (Jones 1980; Harvey 1989, section 3.4; Sarkka an
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,8 @@ _DAMPINGS = (30.0, 1.001, 0.3, 0.1)
 _TIMES = 10
 # Rows that the grid is searched with; more would not tell the colour better.
 _ROWS = 4000
+# Lanes whitened together.
+_LANES = 8
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,12 @@ _on_grid = jax.jit(jax.vmap(jax.vmap(_squares, (None, None, None, 0, 0, 0)), (0,
 _grams = jax.jit(jax.vmap(_gram, (0, None, None, 0, 0, 0)))
 
 
+def _chunks(lanes: int) -> list[np.ndarray]:
+    """Lanes in groups of a fixed size, the last filled up from the first, so that nothing is compiled anew."""
+    places = np.arange(-(-lanes // _LANES) * _LANES) % lanes
+    return list(places.reshape(-1, _LANES))
+
+
 def _variances(weight: np.ndarray) -> Array:
     """White variance of every row in units of one reading's; 0 marks a missing one."""
     return jnp.asarray(np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0))
@@ -125,11 +134,16 @@ def fit_colour(
     """
     grid = _grid(times)
     ratio, frequency, damping = (jnp.asarray(grid[:, i]) for i in range(3))
-    square, logs, number = 0.0, 0.0, 0
+    square: Any = 0.0
+    logs: Any = 0.0
+    number = 0
     for x, w, t in zip(residuals, weight, times, strict=True):
         some = slice(max(0, (len(t) - _ROWS) // 2), max(0, (len(t) - _ROWS) // 2) + _ROWS)
-        a, b = _on_grid(jnp.asarray(x[:, None, some]), _variances(w[some]), _gaps(t[some]), ratio, frequency, damping)
-        square, logs, number = square + np.asarray(a), logs + np.asarray(b), number + int((w[some] > 0).sum())
+        rows = _variances(w[some]), _gaps(t[some])
+        parts = [_on_grid(jnp.asarray(x[c][:, None, some]), *rows, ratio, frequency, damping) for c in _chunks(len(x))]
+        square = square + np.concatenate([np.asarray(a) for a, _ in parts])[: len(x)]
+        logs = logs + np.concatenate([np.asarray(b) for _, b in parts])[: len(x)]
+        number += int((w[some] > 0).sum())
     if known is None:
         value = -0.5 * (number * np.log(np.maximum(square, 1e-300) / number) + logs)
     else:
@@ -140,8 +154,11 @@ def fit_colour(
 def _chosen(grid: np.ndarray, values: np.ndarray) -> Colour:
     best = int(values.argmax())
     if not np.isfinite(values[best]):
-        return Colour(*grid[0], -np.inf)
-    return Colour(*grid[best], float(np.log(np.mean(np.exp(values - values[best])))))
+        best, occam = 0, -np.inf
+    else:
+        occam = float(np.log(np.mean(np.exp(values - values[best]))))
+    ratio, frequency, damping = (float(x) for x in grid[best])
+    return Colour(ratio, frequency, damping, occam)
 
 
 def whitened_gram(
@@ -151,9 +168,11 @@ def whitened_gram(
     colours: list[Colour],
 ) -> tuple[Float[np.ndarray, "lane column column"], Float[np.ndarray, " lane"]]:
     """Gram matrix of the whitened columns in units of the white variance, and the sum of log innovation variances."""
-    shape = (jnp.asarray([getattr(c, f) for c in colours]) for f in ("ratio", "frequency", "damping"))
-    total, logs = _grams(jnp.asarray(columns), _variances(weight), _gaps(times), *shape)
-    return np.asarray(total), np.asarray(logs)
+    shape = [np.array([getattr(c, f) for c in colours]) for f in ("ratio", "frequency", "damping")]
+    rows = _variances(weight), _gaps(times)
+    parts = [_grams(jnp.asarray(columns[c]), *rows, *(jnp.asarray(s[c]) for s in shape)) for c in _chunks(len(columns))]
+    total, logs = (np.concatenate([np.asarray(part[i]) for part in parts])[: len(columns)] for i in range(2))
+    return total, logs
 
 
 def whitened_series(

@@ -168,11 +168,10 @@ class _Answer:
         before = document.fit(self.problem, self.pull or self.before, self.without, self.recordings)
         needed = self.found.of(self.after.combination, "force") or self.after
         after = document.fit(self.problem, needed, self.with_, self.recordings) if self.chosen else before
-        probability = {"consistent": p.as_it_is, "unexplained": p.unexplained}.get(self.verdict)
         return {
             "schema": "symplearn.diagnosis/1",
             "verdict": self.verdict,
-            "probability": float(self.chosen.probability if self.chosen else probability),
+            "probability": self._probability(),
             "log_bayes_factor": self._bayes_factor(),
             "location": self._location(),
             "findings": self._findings(),
@@ -195,6 +194,12 @@ class _Answer:
             "seed": self.options.seed,
             "seconds": round(seconds, 2),
         }
+
+    def _probability(self) -> float:
+        p = self.posterior
+        if self.chosen is not None:
+            return self.chosen.probability
+        return p.as_it_is if self.verdict == "consistent" else p.unexplained
 
     def _bayes_factor(self) -> float | None:
         p = self.posterior
@@ -239,7 +244,7 @@ class _Answer:
         mine = set(self.after.combination)
         out = []
         for w in self.posterior.named:
-            if candidate not in w.combination and w.probability > 0.1 * self.chosen.probability:
+            if candidate not in w.combination and w.probability > 0.1 * self._probability():
                 out += [str(self.problem.equations.candidates[c]) for c in w.combination if c not in mine]
         return list(dict.fromkeys(out))[:4]
 
@@ -252,10 +257,10 @@ class _Answer:
         return self._unexplained_location()
 
     def _where(self) -> str:
-        eq = self.problem.equations
-        moving = [eq.candidates[c].place for c in self.chosen.combination if eq.candidates[c].effect.acts_on == "coordinate"]
+        chosen = [self.problem.equations.candidates[c] for c in self.after.combination]
+        moving = [one.place for one in chosen if one.effect.acts_on == "coordinate"]
         if not moving:
-            return f"in the sensor of {', '.join(dict.fromkeys(eq.candidates[c].target for c in self.chosen.combination))}"
+            return f"in the sensor of {', '.join(dict.fromkeys(one.target for one in chosen))}"
         return where_sentence(self.problem, self.lens[0], moving[0], explained(self.lens[0], moving[0]))
 
     def _unexplained_location(self) -> dict[str, Any]:
@@ -268,7 +273,8 @@ class _Answer:
             strained = strained_coordinates(self.lens)
             kind, targets = "dynamics", [eq.coordinates[i] for i in strained]
             where = where_sentence(self.problem, self.lens[0], strained[0], explained(self.lens[0], strained[0]))
-            windows = [w + [o.recording + 1] if several else w for o in self.lens for w in strained_windows(o, strained[0])]
+            found = [(w, o.recording + 1) for o in self.lens for w in strained_windows(o, strained[0])]
+            windows = [[*w, r] if several else w for w, r in found]
         numbers = list(range(1, len(self.lens) + 1))
         return {"kind": kind, "targets": targets, "recordings": numbers, "time_windows": windows, "where": where}
 
@@ -277,7 +283,8 @@ class _Answer:
         thinned = [r for r in self.problem.rows if r.used < r.given]
         if thinned:
             given, used = sum(r.given for r in self.problem.rows), sum(r.used for r in self.problem.rows)
-            out.append(f"the rows were averaged from {given} to {used}: they are sampled far above the motion's frequencies")
+            out.append(f"the rows were averaged from {given} to {used}: "
+                       "they are sampled far above the motion's frequencies")  # fmt: skip
         if not self.after.converged:
             out.append("the fit did not converge; its numbers are not to be relied on")
         if not all(o.ok for o in (*self.without, *self.with_)):

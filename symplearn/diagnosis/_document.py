@@ -43,7 +43,9 @@ def parameters(problem: Problem, estimate: Estimate, inflation: float) -> dict[s
     }
 
 
-def fit(problem: Problem, needed: Estimate, outlooks: Sequence[Outlook], recordings: Sequence[Recording]) -> dict[str, Any]:
+def fit(
+    problem: Problem, needed: Estimate, outlooks: Sequence[Outlook], recordings: Sequence[Recording]
+) -> dict[str, Any]:
     """Held-out error of the free run in the columns' units, its log density, and the noises.
 
     Free run and density are those of `outlooks`. `needed` is the same hypothesis with a missing force beside it: the
@@ -75,7 +77,9 @@ def finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def alternatives(problem: Problem, posterior: Posterior, verdict: str, chosen: Weighed | None) -> tuple[list[Any], float]:
+def alternatives(
+    problem: Problem, posterior: Posterior, verdict: str, chosen: Weighed | None
+) -> tuple[list[Any], float]:
     """Everything weighed beside the reported combination, likeliest first, and what is left over."""
     rows = [_alternative(problem, w.combination, False, w.probability) for w in posterior.named
             if chosen is None or w.combination != chosen.combination]  # fmt: skip

@@ -8,6 +8,8 @@ from scipy.stats import multivariate_normal, norm
 
 # Probabilities of a half space below this are as good as impossible.
 _TINY = 1e-300
+# Standard deviations that a variance of block sums may lie above its expectation and still be chance.
+_CHANCE = 2.5
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ def variance_inflation(scores: Float[np.ndarray, "time z"], blocks: tuple[int, .
 
     One where the remainder was whitened rightly; large where it is not white on the scale of the motion, so that
     Bayes factors claim more than the data hold (a batch-means estimate of the long-run variance; Geyer 1992). The
-    longest blocks that tell most count.
+    block length that tells most counts, each estimate lowered by what so few blocks show by chance; at least one.
     """
     scores = scores[:, np.abs(scores).sum(0) > 0]
     found = [1.0]
@@ -89,5 +91,6 @@ def variance_inflation(scores: Float[np.ndarray, "time z"], blocks: tuple[int, .
             continue
         sums = scores[: size * number].reshape(number, size, -1).sum(1)
         within = np.maximum((scores**2).mean(0), _TINY)
-        found.append(float(np.median(sums.var(0, ddof=1) / size / within)))
+        chance = 1.0 + _CHANCE * np.sqrt(2.0 / (number * scores.shape[1]))
+        found.append(float(np.median(sums.var(0, ddof=1) / size / within) / chance))
     return max(found)

@@ -42,7 +42,13 @@ def forecast_times(recording: Recording, until: float, step: float | None) -> Fl
 
 
 def forecast(
-    stepper: Stepper, recording: Recording, before: Estimate, after: Estimate, times: np.ndarray, inflation: float, seed: int
+    stepper: Stepper,
+    recording: Recording,
+    before: Estimate,
+    after: Estimate,
+    times: Float[np.ndarray, " time"],
+    inflation: float,
+    seed: int,
 ) -> Forecast:
     """Mean and sd of the expected readings of the first recording, without reading noise."""
     columns: dict[str, dict[str, np.ndarray]] = {name: {} for name in stepper.problem.equations.columns}
@@ -54,7 +60,10 @@ def forecast(
     return Forecast(times, columns)
 
 
-def _draws(stepper: Stepper, recording: Recording, e: Estimate, times: np.ndarray, inflation: float, key: Array) -> np.ndarray:
+def _draws(
+    stepper: Stepper, recording: Recording, e: Estimate, times: np.ndarray, inflation: float, key: Array
+) -> np.ndarray:
+    """Readings (draw, time, channel) of posterior draws, run on from the state filtered through all rows."""
     problem, course, rows = stepper.problem, stepper.courses[0], stepper.problem.rows[0]
     local = problem.local(0)
     root = np.asarray(semidefinite_cholesky(jnp.asarray(e.covariance[np.ix_(local, local)] * inflation)))

@@ -16,29 +16,29 @@ _STANDS_OUT = 2.5
 
 @dataclass(frozen=True)
 class Explained:
-    """Shares of the missing force on one coordinate that go with its speed, its place, and neither."""
+    """What speed and place explain of the missing force on one coordinate: shares of what both together explain.
+
+    The rest of a smoothed missing force is mostly reading noise passed on, so it is not counted against them.
+    """
 
     speed: float
     place: float
-
-    @property
-    def neither(self) -> float:
-        return max(0.0, 1.0 - self.speed - self.place)
 
 
 def explained(outlook: Outlook, coordinate: int) -> Explained:
     """Regress the smoothed missing force on functions of velocity and of position, each beside the other.
 
-    A group's share is how much the fit loses without it (Type III sums of squares), so nothing is counted twice.
+    A group counts by how much the fit loses without it (Type III sums of squares), so nothing is counted twice.
     """
     force = outlook.missing_force()[:, coordinate]
     q, v = motion(outlook)
     q, v = q[:, coordinate], v[:, coordinate]
     q, v = q / max(np.abs(q).max(), 1e-300), v / max(np.abs(v).max(), 1e-300)
     speed, place = np.stack([v, np.abs(v) * v, np.sign(v)], 1), np.stack([np.ones_like(q), q, q**2, q**3], 1)
-    total = max(float((force**2).sum()), 1e-300)
     full = _left(force, np.concatenate([speed, place], axis=1))
-    return Explained((_left(force, place) - full) / total, (_left(force, speed) - full) / total)
+    lost = _left(force, place) - full, _left(force, speed) - full
+    both = max(sum(lost), 1e-300)
+    return Explained(lost[0] / both, lost[1] / both)
 
 
 def motion(outlook: Outlook) -> tuple[np.ndarray, np.ndarray]:
@@ -100,12 +100,10 @@ def whole_windows(outlooks: Sequence[Outlook]) -> list[list[float]]:
 def where_sentence(problem: Problem, outlook: Outlook, coordinate: int, shares: Explained) -> str:
     """What the missing force goes with."""
     name = problem.equations.coordinates[coordinate]
-    speed, place, rest = (f"{100 * max(0.0, x):.0f} %" for x in (shares.speed, shares.place, shares.neither))
-    if shares.speed > max(shares.place, 0.3):
-        opening = f"the missing force on {name} goes with its speed"
-    elif shares.place > max(shares.speed, 0.3):
-        opening = f"the missing force on {name} goes with its place"
-    else:
-        opening = f"the missing force on {name} follows neither its speed nor its place alone"
-    return f"{opening}: {speed} of it is explained by speed, {place} by position, {rest} by neither"
-
+    speed, place = (f"{100 * max(0.0, x):.0f} %" for x in (shares.speed, shares.place))
+    alone = [word for word, share in (("its speed", shares.speed), ("its place", shares.place)) if share > 0.6]
+    goes = alone[0] if alone else "both its speed and its place"
+    return (
+        f"the missing force on {name} goes with {goes}: of what the two explain of it, "
+        f"{speed} goes with speed and {place} with position"
+    )

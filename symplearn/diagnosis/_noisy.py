@@ -30,6 +30,11 @@ class PathFit:
     laplace: Laplace | None = None
     converged: bool = False
 
+    @property
+    def log_evidence(self) -> float:
+        """Log evidence in nats, minus infinity before the first step."""
+        return -np.inf if self.laplace is None else self.laplace.log_evidence
+
 
 def fit_paths(
     stepper: Stepper, starts: Sequence[PathFit], priors: Priors, rows: Sequence[int], iterations: int = 10
@@ -48,7 +53,7 @@ def _fit_chunk(stepper, fits: list[PathFit], priors: Priors, rows: Sequence[int]
     before = np.full(LANES, -np.inf)
     for count in range(iterations):
         fits = _iterate(stepper, fits, priors, rows, weight, noisy=count < iterations - 2)
-        now = np.array([fit.laplace.log_evidence for fit in fits])
+        now = np.array([fit.log_evidence for fit in fits])
         settled = np.abs(now - before) < 0.02
         if (settled | ~np.isfinite(now)).all():
             break
@@ -63,7 +68,8 @@ def _iterate(stepper, fits: list[PathFit], priors: Priors, rows, weight, noisy: 
     steps = [_integrated(problem, fits[b], [(p[2], b) for p in passes], priors, weight) for b in range(LANES)]
     z = _clipped(problem, np.stack([fit.z + one.step for fit, one in zip(fits, steps, strict=True)]))
     moved = z - np.stack([fit.z for fit in fits])
-    paths, squares, numbers = [[] for _ in fits], 0.0, 0.0
+    paths: list[list[np.ndarray]] = [[] for _ in fits]
+    squares, numbers = 0.0, 0.0
     for r, (linear, variances, done) in enumerate(passes):
         local = problem.local(r)
         back = backward_lanes(linear, done, variances, jnp.asarray(moved[:, local]))
@@ -75,9 +81,7 @@ def _iterate(stepper, fits: list[PathFit], priors: Priors, rows, weight, noisy: 
     noise = np.stack([fit.noise for fit in fits])
     if noisy:
         noise = _next_noise(problem, noise, squares / np.maximum(numbers, 1))
-    return [
-        replace(fit, z=z[b], noise=noise[b], paths=paths[b], laplace=steps[b]) for b, fit in enumerate(fits)
-    ]
+    return [replace(fit, z=z[b], noise=noise[b], paths=paths[b], laplace=steps[b]) for b, fit in enumerate(fits)]
 
 
 def _next_noise(problem: Problem, noise: np.ndarray, expected: np.ndarray) -> np.ndarray:

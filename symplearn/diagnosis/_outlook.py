@@ -110,8 +110,13 @@ class Outlook:
     def held_out_errors(self, times: np.ndarray, readings: np.ndarray) -> Float[np.ndarray, "row channel"]:
         """Readings minus the free run at original times after the last fitted row; NaN where nothing was read."""
         run = self.readings[self.rows.fitted - 1 :]
-        return readings - CubicSpline(self.rows.times[self.rows.fitted - 1 :], run)(times) if len(run) > 3 else (
-            readings - np.stack([np.interp(times, self.rows.times[self.rows.fitted - 1 :], c) for c in run.T], axis=1)
+        return (
+            readings - CubicSpline(self.rows.times[self.rows.fitted - 1 :], run)(times)
+            if len(run) > 3
+            else (
+                readings
+                - np.stack([np.interp(times, self.rows.times[self.rows.fitted - 1 :], c) for c in run.T], axis=1)
+            )
         )
 
     def held_out_log_density(self) -> float:
@@ -144,4 +149,3 @@ class Outlook:
     def _run(self, x: np.ndarray, rows: slice) -> Any:
         p, e = self.stepper.problem, self.estimate
         return free_run(p, self.stepper.courses[self.recording], e.z, e.combination, self.recording, x, rows)
-

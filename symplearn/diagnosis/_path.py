@@ -82,7 +82,9 @@ def forward(linear: Linear, variances: Array, intensity: Array, lengths: Array) 
         lin, r, length = data
         M0, P0 = M, P
         own = jnp.concatenate([lin.residual[:, None], jnp.zeros_like(zeros), -lin.G], axis=1)
-        gains, innovations, spread = [], [], []
+        gains: list[Array] = []
+        innovations: list[Array] = []
+        spread: list[Array] = []
         for j in range(lin.H.shape[0]):  # channels are few, and independent given the state
             h, seen = lin.H[j], r[j] > 0
             S = jnp.where(seen, h @ P @ h + r[j], 1.0)
@@ -115,7 +117,7 @@ def backward(linear: Linear, done: Pass, variances: Array, delta: Array) -> Smoo
     def step(carry, data):
         adjoint, information = carry
         lin, M, P, K, e, S, r = data
-        own = []
+        own: list[Array] = []
         for j in reversed(range(lin.H.shape[0])):
             h, seen = lin.H[j], r[j] > 0
             u = jnp.where(seen, e[j] @ column / S[j] - K[j] @ adjoint, 0.0)

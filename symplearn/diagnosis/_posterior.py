@@ -14,8 +14,6 @@ from ._weighed import Estimate
 _UNINFORMED = 0.7
 # Kinds of remainder other than white noise; each combination divides its remainder's prior among them.
 _REMAINDERS = ("coloured", "force")
-# Inflation below this is what whitened rows show by chance.
-_CHANCE = 1.7
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     families = sorted({c.effect.family for c in candidates} | {"any"})
     price = {problem.searched[i]: p for i, p in prices(candidates, families).items()}
     remainder = 1.0 / len(families)
-    factor = 1.0 / inflation if inflation > _CHANCE else 1.0
+    factor = 1.0 / max(1.0, inflation)
     top = max(e.log_evidence for es in found.estimates.values() for e in es)
     white, other, named = -np.inf, -np.inf, []
     evidences: dict[Combination, float] = {}
@@ -82,9 +80,8 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
 
 def _mixture(values: Sequence[float]) -> float:
     """Log of the mean of exponentials."""
-    values = np.array(values)
-    top = values.max()
-    return float(top + np.log(np.mean(np.exp(values - top)))) if np.isfinite(top) else -np.inf
+    top = max(values)
+    return float(top + np.log(np.mean(np.exp(np.array(values) - top)))) if np.isfinite(top) else -np.inf
 
 
 def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
@@ -96,4 +93,5 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
     best = max(found.estimates[combination], key=lambda e: e.log_evidence)
     first = problem.head + problem.calibrated.size
     sd = np.sqrt(np.diag(best.covariance)[first : first + len(combination)])
-    return bool(np.isfinite(best.log_evidence)) and bool((sd < _UNINFORMED * found.priors.scales[list(combination)]).all())
+    known = sd < _UNINFORMED * found.priors.scales[list(combination)]
+    return bool(np.isfinite(best.log_evidence) and known.all())

@@ -14,11 +14,11 @@ from .._simulation_records import SimulationFile
 class Series:
     """One recording as the simulation before and after sees it; rows after thinning, fitted and held out.
 
-    `readings`, `before`, `after` are (time, channel) in the columns' units, NaN where nothing was read. `before` and
-    `after` are filtered up to `boundary` and run freely after it. `force_before` and `force_after` (time, coordinate) are
-    the smoothed missing force over the fitted rows, `strain_*` its standardised disturbances; `position` and
-    `velocity` (time, coordinate) are the smoothed motion they belong to. `energy_*` (time,) is the Hamiltonian along
-    the smoothed motion.
+    `readings`, `before`, `after` are (time, channel) in the columns' units, NaN where nothing was read. `before` is
+    the calibrated simulation as it is, `after` has the findings; both run freely after `boundary`. `force_before` and
+    `force_after` (time, coordinate) are the smoothed missing force over the fitted rows, `strain_*` its standardised
+    disturbances; `position` and `velocity` (time, coordinate) are the smoothed motion they belong to. `energy_*`
+    (time,) is the Hamiltonian along the smoothed motion.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The search: nothing left out, then single effects, pairs, triples; each fitted, then weighed under every remainder."""
+"""The search: nothing left out, single effects, pairs, triples; each fitted, and weighed under every remainder."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -9,10 +9,10 @@ import numpy as np
 
 from ._calibrate import Priors, grow
 from ._noisy import PathFit, fit_paths
-from ._problem import SLOTS, Combination, Problem
+from ._problem import SLOTS, Combination
 from ._start import priors_without_effects, scales, typical_forces, windows
 from ._stochastic import run_filter
-from ._trajectory import LANES, Stepper
+from ._trajectory import Stepper
 from ._weighed import Estimate, weigh_coloured, weigh_white
 
 # A window grows in these steps, so that a trajectory fit is not caught in a local minimum.
@@ -55,29 +55,26 @@ class Found:
 class Search:
     """Finds which combinations of effects explain the recordings of a problem, and with what evidence."""
 
-    def __init__(
-        self, stepper: Stepper, seeds: np.ndarray, deadline: float, progress: Callable[[str], None]
-    ):
+    def __init__(self, stepper: Stepper, seeds: np.ndarray, deadline: float, progress: Callable[[str], None]):
         self.problem, self.stepper, self.seeds, self.seed = stepper.problem, stepper, seeds, seeds[0]
         self.rows = [r.fitted for r in self.problem.rows]
         self.deadline, self.progress = deadline, progress
 
     def run(self) -> Found:
         """Search, smallest combinations first."""
-        self.progress("calibrating the simulation")
         bare = priors_without_effects(self.problem)
         self.found = Found(bare)
-        self._add_null(bare)
         self.progress("following the recording with a missing force")
         self.null_paths = self._null_paths(bare)
-        best = max(self.null_paths, key=lambda fit: fit.laplace.log_evidence)
+        best = max(self.null_paths, key=lambda fit: fit.log_evidence)
         self.typical = typical_forces(self.problem, best.z, best.paths)
         self.found.priors = replace(bare, scales=scales(self.problem, best.z, best.paths))
         for size in range(1, SLOTS + 1):
             candidates = self._proposals(size)
             if not candidates or not self._in_time():
                 break
-            self.progress(f"weighing {len(candidates)} combinations of {size} effect{'s' * (size > 1)}")
+            named = "single effects" if size == 1 else f"combinations of {size} effects"
+            self.progress(f"weighing {len(candidates)} {named}")
             self._weigh(candidates)
             self._exchange(size)
             if size > 1 and self._long and not self._gained(size):
@@ -92,15 +89,6 @@ class Search:
             self.found.complete = False
         return self.found.complete
 
-    def _add_null(self, priors: Priors) -> None:
-        """The simulation as it is, from the best few starts."""
-        starts = self.seeds[:LANES]
-        fits = grow(self.stepper, starts, [()] * len(starts), priors, self._windows(), final=20)
-        white = weigh_white(self.problem, fits, priors, self.rows)
-        best = int(np.argmax([e.log_evidence for e in white]))
-        self.found.add(white[best])
-        self.found.add(weigh_coloured(self.problem, fits, priors, self.rows)[best])
-
     def _windows(self) -> list[list[int]]:
         return windows(self.rows, _GROWTH, max(8, 4 * self.problem.state))
 
@@ -114,7 +102,7 @@ class Search:
         for share in _SHARES:
             start = PathFit((), self._intensity(share), self.seed, guess, first)
             starts.append(start)
-        fits = fit_paths(self.stepper, starts, priors, self.rows)
+        fits = fit_paths(self.stepper, starts, priors, self.rows, self._path_steps)
         self._add_paths(fits)
         return fits
 
@@ -127,9 +115,9 @@ class Search:
         """Reading noise from third differences, which a smooth motion hardly has."""
         out = []
         for j, known in enumerate(self.problem.noise):
-            squares = [np.diff(r.readings[:n, j], 3) ** 2 / 20 for r, n in zip(self.problem.rows, self.rows, strict=True)]
-            joined = np.concatenate(squares)
-            spread = np.nanstd(np.concatenate([r.readings[:n, j] for r, n in zip(self.problem.rows, self.rows, strict=True)]))
+            columns = [r.readings[:n, j] for r, n in zip(self.problem.rows, self.rows, strict=True)]
+            joined = np.concatenate([np.diff(column, 3) ** 2 / 20 for column in columns])
+            spread = np.nanstd(np.concatenate(columns))
             rough = np.sqrt(np.nanmedian(joined) / 0.455) if np.isfinite(joined).any() else spread
             count = max(1.0, float(np.median(self.problem.rows[0].counts[:, j])))
             out.append(known if np.isfinite(known) else max(rough, 1e-6 * spread) * np.sqrt(count))
@@ -153,10 +141,10 @@ class Search:
         """Combinations of one size: every single effect, then what extends the best of the size below."""
         searched = self.problem.searched
         if size == 1:
-            return [(c,) for c in searched]
+            return [(), *((c,) for c in searched)]
         if size == 2 and len(searched) <= 12:
             return list(combinations(searched, 2))
-        known = [c for c in self.found.estimates if len(c) == size - 1]
+        known = [c for c in self.found.estimates if len(c) == size - 1 and c]
         top = max((self.found.best(c) for c in known), default=-np.inf)
         ranked = sorted(known, key=self.found.best, reverse=True)
         kept = [c for c in ranked if self.found.best(c) > top - _REACH][:_KEPT] or ranked[:_KEPT]
@@ -170,9 +158,11 @@ class Search:
         if size == 1 or not self._in_time():
             return
         mine = sorted((c for c in self.found.estimates if len(c) == size), key=self.found.best, reverse=True)
+        if self._long and not self._gained(size):
+            return
         swapped = {
             tuple(sorted((*c[:k], *c[k + 1 :], one)))
-            for c in mine[: _KEPT // 2]
+            for c in mine[: 1 if self._long else _KEPT // 2]
             for k in range(size)
             for one in self.problem.searched
             if one not in c
@@ -196,7 +186,8 @@ class Search:
         if cut < len(growing) and len(candidates) > _KEPT:
             fits = grow(self.stepper, start, candidates, self.found.priors, growing[:cut], final=20)
             values = [e.log_evidence for e in weigh_white(self.problem, fits, self.found.priors, growing[cut - 1])]
-            kept = np.argsort(values)[::-1][:_KEPT]
+            order = [int(k) for k in np.argsort(values)[::-1]]
+            kept = sorted(order[:_KEPT], key=lambda k: -values[k]) + [k for k in order[_KEPT:] if not candidates[k]]
             start, candidates, growing = fits.z[kept], [candidates[k] for k in kept], growing[cut:]
         fits = grow(self.stepper, start, candidates, self.found.priors, growing)
         for estimate in weigh_white(self.problem, fits, self.found.priors, self.rows):
@@ -208,6 +199,10 @@ class Search:
     def _long(self) -> bool:
         """Whether the recordings are too long for every combination to see all of them."""
         return self._first_part(self._windows()) < len(_GROWTH)
+
+    @property
+    def _path_steps(self) -> int:
+        return 6 if self._long else 10
 
     def _first_part(self, growing: list[list[int]]) -> int:
         """How many of the growing windows are affordable for every combination."""
@@ -226,24 +221,35 @@ class Search:
         """Best combinations again, each with a missing force beside it."""
         named = [c for c in self.found.estimates if c]
         contenders = sorted(named, key=self.found.best, reverse=True)[: _KEPT // 2 if self._long else _KEPT]
-        null = max(self.null_paths, key=lambda fit: fit.laplace.log_evidence)
+        null = max(self.null_paths, key=lambda fit: fit.log_evidence)
         starts = []
         for c in contenders:
             white = self.found.of(c, "white")
+            assert white is not None  # every combination is weighed under white noise first
             for share in _SHARES[: -1 : 2 if self._long else 1]:
                 starts.append(PathFit(c, self._intensity(share), white.z, null.noise, null.paths))
-        self._add_paths(fit_paths(self.stepper, starts, self.found.priors, self.rows))
+        self._add_paths(fit_paths(self.stepper, starts, self.found.priors, self.rows, self._path_steps))
 
     def _add_paths(self, fits: Sequence[PathFit]) -> None:
         """Of the intensities tried for each combination, the best, owing for the choice."""
         for combination in dict.fromkeys(fit.combination for fit in fits):
             mine = [fit for fit in fits if fit.combination == combination]
-            values = np.array([fit.laplace.log_evidence for fit in mine])
+            values = np.array([fit.log_evidence for fit in mine])
             if not np.isfinite(values).any():
                 continue
             best = mine[int(np.argmax(values))]
+            assert best.laplace is not None  # its evidence is finite
             mean = values.max() + np.log(np.mean(np.exp(values - values.max())))
             self.found.add(
-                Estimate(combination, "force", best.z, best.laplace.covariance, best.noise, float(mean),
-                         best.converged, intensity=best.intensity, paths=best.paths)  # fmt: skip
+                Estimate(
+                    combination,
+                    "force",
+                    best.z,
+                    best.laplace.covariance,
+                    best.noise,
+                    float(mean),
+                    best.converged,
+                    intensity=best.intensity,
+                    paths=best.paths,
+                )  # fmt: skip
             )

@@ -19,7 +19,7 @@ STRENGTH = 0.3
 
 
 def priors_without_effects(problem: Problem) -> Priors:
-    """Priors of calibrated values and initial states; effects are held at zero by an infinite precision nowhere used."""
+    """Priors of calibrated values and initial states; the effects have no scale yet."""
     c, size = problem.calibrated, problem.size
     mean, precision = np.zeros(size), np.zeros(size)
     mean[: problem.head] = np.tile(problem.initial.mean, len(problem.rows))

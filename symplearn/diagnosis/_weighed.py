@@ -53,8 +53,16 @@ def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -
         one = _laplace(problem, combination, gram, offset[b], fits.z[b], priors)
         scores = _scores(problem, fits, b, r, weight)
         out.append(
-            Estimate(combination, "white", fits.z[b], one.covariance, fits.noise[b], one.log_evidence,
-                     bool(fits.converged[b]), variance_inflation(scores))  # fmt: skip
+            Estimate(
+                combination,
+                "white",
+                fits.z[b],
+                one.covariance,
+                fits.noise[b],
+                one.log_evidence,
+                bool(fits.converged[b]),
+                variance_inflation(scores),
+            )  # fmt: skip
         )
     return out
 
@@ -134,13 +142,12 @@ def coloured_inflation(stepper: Stepper, estimate: Estimate, rows: list[int]) ->
     """Variance inflation that is left after a coloured error was whitened."""
     problem, weight = stepper.problem, weights(stepper.problem, rows)
     predictions = stepper.predict(estimate.z[None], [estimate.combination], rows)
-    fits = Fits([estimate.combination], estimate.z[None], estimate.noise[None], predictions, np.zeros(1), np.ones(1, bool))
     parts = []
     for k, (x, w) in enumerate(zip(residuals(problem, predictions, weight), weight, strict=True)):
         total = 0.0
         for j, colour in enumerate(estimate.colours):
             slopes = np.where(w[:, j] > 0, predictions[k].slopes[0, problem.state :, :, j], 0.0)
-            columns = np.concatenate([x[0, None, :, j], slopes]) / fits.noise[0, j]
+            columns = np.concatenate([x[0, None, :, j], slopes]) / estimate.noise[j]
             series = whitened_series(columns, w[:, j], problem.rows[k].times[: len(w)], colour)
             total = total + series[:, :1] * series[:, 1:]
         parts.append(total)

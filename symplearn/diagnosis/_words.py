@@ -8,11 +8,11 @@ from ._problem import Combination, Problem
 
 _OPENINGS = {
     "viscous_damping": "A force against the motion of {target}, proportional to its speed, was left out: {law}.",
-    "quadratic_drag": "A force against the motion of {target}, growing with the square of its speed, was left out: {law}.",
+    "quadratic_drag": "A force against the motion of {target}, as the square of its speed, was left out: {law}.",
     "coulomb_friction": "Dry friction on {target}, of constant size against the motion, was left out: {law}.",
     "constant_force": "A constant force on {target} was left out: {law}.",
     "linear_stiffness": "A restoring force proportional to {target} was left out: {law}.",
-    "quadratic_stiffness": "A force that grows with the square of {target}, uneven on its two sides, was left out: {law}.",
+    "quadratic_stiffness": "A force as the square of {target}, uneven on its two sides, was left out: {law}.",
     "cubic_stiffness": "A force that grows with the cube of {target} was left out: {law}.",
     "sensor_bias": "The sensor of {target} reads off by a constant: {law}.",
     "sensor_gain": "The sensor of {target} reads in a wrong scale: {law}.",
@@ -83,7 +83,9 @@ def symbol_of(candidate: Candidate) -> str:
     return f"F = {law.format(c=name)}".replace("--", "")
 
 
-def finding_sentence(candidate: Candidate, mean: float, sd: float, share: float, unit: str, rivals: Sequence[str]) -> str:
+def finding_sentence(
+    candidate: Candidate, mean: float, sd: float, share: float, unit: str, rivals: Sequence[str]
+) -> str:
     """Cause, law with its number, how strong, what it does, what it cannot be told from."""
     name = candidate.effect.coefficient
     known = f"{symbol_of(candidate)} with {name} = {number(mean)} +- {number(sd)}{' ' + unit if unit else ''}"
@@ -103,7 +105,8 @@ def next_measurement(problem: Problem, posterior: Posterior, chosen: Combination
         if not rivals or posterior.as_it_is > 0.9:
             return "none is needed; a longer recording at another amplitude would test the simulation harder"
     names = [{problem.equations.candidates[c].effect.name for c in rival} for rival in rivals]
-    disputed: set[str] = set().union(*names) - set.intersection(*names) if len(names) > 1 else set()
+    shared = frozenset[str]().union(*names[:1]).intersection(*names)
+    disputed = frozenset[str]().union(*names) - shared
     advice = [text for kin, text in _UNMASK if len(kin & disputed) >= 2 or (len(kin & disputed) == 1 and len(kin) == 2)]
     if chosen is None and posterior.unexplained > 0.5:
         advice.append("more channels and a faster sampling where the strain is largest, to see what acts there")

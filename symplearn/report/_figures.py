@@ -46,10 +46,10 @@ def not_drawn(diagnosis: Diagnosis) -> list[str]:
 
 
 _MOTION = (
-    "Up to the shaded part, the lines follow the readings; in it they run freely from the last fitted row "
+    "The lines are fitted to the rows before the shaded part; in it they run freely from the last fitted row "
     "and never look at a reading. A line that leaves the readings by far is cut at the edge."
 )
-_ALL_FITTED = "The lines follow the readings: no row was kept from the fits."
+_ALL_FITTED = "The lines are fitted to all rows: none was kept from the fits."
 _FORCES = (
     "The force that the readings ask for beyond the equations of motion, estimated along the fitted rows. "
     "What is a law of speed is a curve against velocity; what is a law of place, against position."

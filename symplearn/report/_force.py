@@ -10,7 +10,8 @@ from matplotlib.axes import Axes
 from ..diagnosis._record import Diagnosis, Series
 from ._decimate import evenly
 from ._law import added_force
-from ._panel import AFTER, LAW, Panel, finite, first_look, labels, legend, limits, line, panel, with_unit
+from ._palette import AFTER, LAW
+from ._panel import Panel, finite, first_look, labels, legend, limits, line, panel, with_unit
 from ._units import force_unit, time_unit
 
 
@@ -71,15 +72,7 @@ def _over_time(axes: Axes, one: Missing) -> None:
     axes.set_ylim(_force_limits(one))
     line(axes, one.times, one.before, linewidth=1.0, **first_look(one.after is not None))
     if one.law is not None:
-        line(
-            axes,
-            one.times,
-            one.law,
-            color=LAW,
-            linewidth=1.0,
-            linestyle=(0, (4, 1.5)),
-            label="what was added",
-        )
+        line(axes, one.times, one.law, color=LAW, linewidth=1.0, linestyle="--", label="what was added")
     if one.after is not None:
         line(axes, one.times, one.after, color=AFTER, linewidth=1.0, label="after")
     labels(axes, one.time_label, one.force_label)
@@ -87,6 +80,7 @@ def _over_time(axes: Axes, one: Missing) -> None:
 
 
 def _against(axes: Axes, one: Missing, x: Float[np.ndarray, " fitted"], label: str) -> None:
+    axes.set_xlim(limits(x))
     axes.set_ylim(_force_limits(one))
     some = evenly(len(x))
     look: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 2.2, "markeredgewidth": 0}

@@ -5,7 +5,8 @@ from matplotlib.axes import Axes
 
 from ..diagnosis._record import Diagnosis, Forecast
 from ._decimate import evenly
-from ._panel import AFTER, BEFORE, Panel, labels, legend, limits, line, panel, with_unit
+from ._palette import AFTER, BEFORE
+from ._panel import Panel, labels, legend, limits, line, panel, with_unit
 from ._units import time_unit
 
 

@@ -80,7 +80,8 @@ def _finding(finding: Mapping[str, Any], diagnosis: Diagnosis) -> dict[str, Any]
         }
         for name, value in finding["coefficients"].items()
     ]
-    return {"effect": effect(finding), "record": finding, "coefficients": coefficients}
+    units = any(coefficient["unit"] for coefficient in coefficients)
+    return {"effect": effect(finding), "record": finding, "coefficients": coefficients, "units": units}
 
 
 def _fit_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str, str]]:

@@ -27,7 +27,8 @@ def added_force(
         and isinstance(EFFECTS.get(finding["effect"]), Drag | PowerForce)
         and recording in (finding.get("recordings") or [recording])
     ]
-    return sum((_force(finding, q, v) for finding in here), np.zeros(len(q))) if here else None
+    with np.errstate(over="ignore", invalid="ignore"):  # a motion that diverged is drawn as far as it goes
+        return sum((_force(finding, q, v) for finding in here), np.zeros(len(q))) if here else None
 
 
 def _force(finding: Mapping[str, Any], q: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -7,7 +7,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 
 from ..diagnosis._record import Diagnosis, Series
-from ._panel import AFTER, READING, Panel, dots, first_look, labels, legend, limits, line, panel, with_unit
+from ._palette import AFTER, READING, SHADE
+from ._panel import Panel, dots, first_look, labels, legend, limits, line, panel, with_unit
 from ._units import time_unit
 
 _CYCLES = 10  # in a close-up
@@ -77,12 +78,15 @@ def close_up(axes: Axes, one: Channel) -> None:
     """The last cycles of the held-out rows, or of all rows where none is held out."""
     first, last = close_up_window(one)
     _motion(axes, one, (one.times >= first) & (one.times <= last), width=1.4)
-    axes.set_xlim(first, last)
+    if last > first:
+        axes.set_xlim(first, last)
 
 
 def close_up_window(one: Channel) -> tuple[float, float]:
-    """The held-out rows, or their last ten cycles where they hold more."""
-    rows = one.times > one.boundary if one.held_out else np.ones(len(one.times), bool)
+    """The held-out rows, or their last ten cycles; all rows where at most one is held out."""
+    rows = one.times > one.boundary
+    if rows.sum() < 2:
+        rows = np.ones(len(one.times), bool)
     times, motion = one.times[rows], one.best[rows]
     motion = np.where(np.isfinite(motion), motion, np.nan)
     above = motion > np.nanmean(motion) if np.isfinite(motion).any() else np.zeros(len(motion), bool)
@@ -105,9 +109,7 @@ def _motion(axes: Axes, one: Channel, rows: np.ndarray, width: float) -> None:
 
 def _shade(axes: Axes, one: Channel) -> None:
     if one.held_out:
-        axes.axvspan(
-            one.boundary, float(one.times[-1]), color="#f3efe2", linewidth=0, label="held out", zorder=0
-        )
+        axes.axvspan(one.boundary, float(one.times[-1]), color=SHADE, linewidth=0, label="held out", zorder=0)
 
 
 def _residuals(axes: Axes, one: Channel) -> None:

@@ -16,10 +16,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ._decimate import envelope, evenly
+from ._palette import AFTER, BEFORE, GRID, in_palette
 from ._words import plain
 
-# Okabe and Ito's palette: told apart by the colour-blind, and on grey paper by their lightness.
-BEFORE, AFTER, LAW, READING = "#D55E00", "#0072B2", "#009E73", "#666666"
 STYLE: dict[Any, Any] = {
     "text.usetex": False,
     "text.parse_math": False,  # a dollar sign of a file is a dollar sign
@@ -30,7 +29,7 @@ STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
-    "grid.color": "#e6e6e6",
+    "grid.color": GRID,
     "axes.axisbelow": True,
     "axes.formatter.useoffset": False,
     "legend.frameon": False,
@@ -58,7 +57,7 @@ def panel(draw: Callable[[Axes], None], alt: str) -> Panel:
 
 
 def render(draw: Callable[[Figure], None], size: tuple[float, float], dpi: int) -> bytes:
-    """PNG of a figure. 256 colours: a report of many pictures stays small."""
+    """PNG of a figure."""
     with matplotlib.rc_context(STYLE), warnings.catch_warnings():
         # A name of a file may hold letters that the font has not.
         warnings.filterwarnings("ignore", message="Glyph .* missing")
@@ -68,10 +67,7 @@ def render(draw: Callable[[Figure], None], size: tuple[float, float], dpi: int) 
         canvas.draw()
         image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     file = io.BytesIO()
-    # The octree keeps rare colours; the median cut turns a few blue dots grey.
-    few = image.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    few.putpalette([255 if level > 249 else level for level in few.getpalette() or []])  # white stays white
-    few.save(file, "PNG", optimize=True)
+    in_palette(image).save(file, "PNG")
     return file.getvalue()
 
 

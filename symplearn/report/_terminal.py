@@ -46,5 +46,5 @@ def _held_out(diagnosis: Diagnosis) -> list[str]:
         if diagnosis.document["verdict"] != "consistent" and now is not None:
             line += f" -> {number(now, 3)}"
             unit += f" ({ratio(old, now)} times smaller)" if 0 < now < old else ""
-        lines.append(f"{line} {unit}".rstrip())
+        lines.append(" ".join(f"{line} {unit}".split()))
     return lines

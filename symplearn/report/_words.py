@@ -62,5 +62,5 @@ def effect(finding: Mapping[str, Any]) -> str:
 def combination(findings: list[Mapping[str, Any]], unexplained: bool = False) -> str:
     """A combination of effects in words, or one of the two without any."""
     if findings:
-        return " with ".join(map(effect, findings))
+        return ", ".join(map(effect, findings))
     return "something without a name (process noise alone)" if unexplained else "nothing left out"

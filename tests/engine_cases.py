@@ -1,0 +1,57 @@
+"""Small simulations, and recordings made by SciPy, shared by the tests of the diagnosis engine's parts."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from symplearn._inputs import Inputs
+from symplearn._recording import Recording
+from symplearn._simulation_file import parse_simulation
+from symplearn._simulation_records import SimulationFile
+from symplearn.diagnosis._build import Restriction, augmented_equations, build
+from symplearn.diagnosis._problem import Problem
+
+
+def simulation(
+    hamiltonian: str,
+    coordinates: Sequence[str] = ("q",),
+    momenta: Sequence[str] = ("p",),
+    observe: dict[str, str] | None = None,
+    more: str = "",
+    recording: str = "",
+) -> SimulationFile:
+    """A simulation file; `more` is further TOML at its end, `recording` further keys of that section."""
+    listed = "\n".join(f'{column} = "{h}"' for column, h in (observe or {"y": coordinates[0]}).items())
+    text = f"""
+[system]
+coordinates = {list(coordinates)}
+momenta = {list(momenta)}
+hamiltonian = "{hamiltonian}"
+
+[recording]
+time = "t_s"
+{recording}
+[recording.observe]
+{listed}
+{more}
+"""
+    return parse_simulation(text, "case.toml")
+
+
+def recorded(times, readings, inputs: Inputs | None = None, number: int = 1, columns=None) -> Recording:
+    """A recording of given readings (time, channel)."""
+    readings = np.asarray(readings, float).reshape(len(times), -1)
+    columns = columns or tuple(f"y{j}" for j in range(readings.shape[1]))
+    return Recording(number, f"run{number}.csv", columns, np.asarray(times), readings, np.arange(len(times)) + 2, inputs)
+
+
+def problem(file: SimulationFile, recordings: Sequence[Recording], substep: float, holdout: float = 0.0) -> Problem:
+    """What is fitted, with every effect searched."""
+    return build(file, augmented_equations(file), recordings, holdout, substep, Restriction())
+
+
+def solved(rates: Callable, start: Sequence[float], times: np.ndarray, tolerance: float = 1e-10) -> np.ndarray:
+    """SciPy's DOP853 (time, state)."""
+    span = (float(times[0]), float(times[-1]))
+    return solve_ivp(rates, span, start, "DOP853", times, rtol=tolerance, atol=tolerance * 1e-2).y.T
