@@ -208,7 +208,6 @@ def refined(
 def _trajectories(problem: Problem, z: np.ndarray) -> list[np.ndarray]:
     out = []
     for r, course in enumerate(courses(problem)):
-        rows = slice(0, problem.rows[r].fitted)
         x = z[r * problem.state : (r + 1) * problem.state]
-        out.append(np.asarray(free_run(problem, course, z, (), r, x, rows)[0]))
+        out.append(free_run(problem, course, z, (), r, x, 0)[0][: problem.rows[r].fitted])
     return out

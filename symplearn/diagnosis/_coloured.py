@@ -22,6 +22,8 @@ _TIMES = 10
 _ROWS = 4000
 # Lanes whitened together.
 _LANES = 8
+# Rows are filled up to a multiple of this, so that recordings share compiled functions.
+_ROUND = 512
 
 
 @dataclass(frozen=True)
@@ -107,11 +109,17 @@ def _chunks(lanes: int) -> list[np.ndarray]:
 
 def _variances(weight: np.ndarray) -> Array:
     """White variance of every row in units of one reading's; 0 marks a missing one."""
-    return jnp.asarray(np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0))
+    return _filled(np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0))
 
 
 def _gaps(times: np.ndarray) -> Array:
-    return jnp.asarray(np.append(np.diff(times), 0.0))
+    return _filled(np.append(np.diff(times), 0.0))
+
+
+def _filled(values: np.ndarray) -> Array:
+    """Rows filled up with zeros to a round number: missing ones without gaps, which change nothing."""
+    lack = -values.shape[-1] % _ROUND
+    return jnp.asarray(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, lack)]))
 
 
 def _grid(times: list[np.ndarray]) -> np.ndarray:
@@ -140,7 +148,7 @@ def fit_colour(
     for x, w, t in zip(residuals, weight, times, strict=True):
         some = slice(max(0, (len(t) - _ROWS) // 2), max(0, (len(t) - _ROWS) // 2) + _ROWS)
         rows = _variances(w[some]), _gaps(t[some])
-        parts = [_on_grid(jnp.asarray(x[c][:, None, some]), *rows, ratio, frequency, damping) for c in _chunks(len(x))]
+        parts = [_on_grid(_filled(x[c][:, None, some]), *rows, ratio, frequency, damping) for c in _chunks(len(x))]
         square = square + np.concatenate([np.asarray(a) for a, _ in parts])[: len(x)]
         logs = logs + np.concatenate([np.asarray(b) for _, b in parts])[: len(x)]
         number += int((w[some] > 0).sum())
@@ -170,7 +178,7 @@ def whitened_gram(
     """Gram matrix of the whitened columns in units of the white variance, and the sum of log innovation variances."""
     shape = [np.array([getattr(c, f) for c in colours]) for f in ("ratio", "frequency", "damping")]
     rows = _variances(weight), _gaps(times)
-    parts = [_grams(jnp.asarray(columns[c]), *rows, *(jnp.asarray(s[c]) for s in shape)) for c in _chunks(len(columns))]
+    parts = [_grams(_filled(columns[c]), *rows, *(jnp.asarray(s[c]) for s in shape)) for c in _chunks(len(columns))]
     total, logs = (np.concatenate([np.asarray(part[i]) for part in parts])[: len(columns)] for i in range(2))
     return total, logs
 
@@ -183,4 +191,4 @@ def whitened_series(
 ) -> Float[np.ndarray, "time column"]:
     """The whitened columns of one lane, row by row, in units of the white sd."""
     shape = (jnp.asarray(x) for x in (colour.ratio, colour.frequency, colour.damping))
-    return np.asarray(_series(jnp.asarray(columns), _variances(weight), _gaps(times), *shape))
+    return np.asarray(_series(_filled(columns), _variances(weight), _gaps(times), *shape))[: len(times)]

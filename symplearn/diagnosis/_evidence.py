@@ -38,7 +38,8 @@ def laplace(
     a = np.nonzero(active)[0]
     matrix = gram[1:, 1:][np.ix_(a, a)] + np.diag(precision[a])
     vector = gram[0, 1:][a] - precision[a] * (z - mean)[a]
-    scale = np.sqrt(np.maximum(np.diag(matrix), _TINY))
+    diagonal = np.diag(matrix)
+    scale = np.sqrt(np.where(diagonal > _TINY, diagonal, 1.0))
     scaled = matrix / np.outer(scale, scale)
     values, vectors = np.linalg.eigh(scaled)
     values = np.maximum(values, 1e-13)  # a direction that neither data nor prior hold keeps a wide, finite spread

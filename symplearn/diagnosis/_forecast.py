@@ -17,7 +17,7 @@ from .._rows import spans_between
 from ._outlook import colour_ratio, intensity_of, start_spread, total_noise
 from ._problem import Problem
 from ._record import Forecast
-from ._stochastic import filter_lane, row_roots, softness
+from ._stochastic import filter_lane, padded, row_roots, softness
 from ._trajectory import Stepper, model_at
 from ._weighed import Estimate
 
@@ -74,10 +74,10 @@ def _draws(
     pieces = max(1, math.ceil(np.max(np.diff(path)) / float(np.max(rows.spans.step)) - 1e-9))
     inputs = np.zeros((len(times), 0)) if recording.inputs is None else recording.inputs.at(times)
     ahead = (spans_between(path, pieces, recording.inputs), jnp.asarray(times), jnp.asarray(inputs))
-    onehot, noise = problem.onehot(e.combination), total_noise(e)
+    onehot, noise, length = problem.onehot(e.combination), total_noise(e), course.times.shape[0]
     fixed = (jnp.asarray(noise), jnp.asarray(intensity_of(stepper, e)), jnp.asarray(softness(problem, course, e.z, 0)),
-             jnp.asarray(start_spread(stepper, e, 0)), jnp.asarray(rows.readings),
-             jnp.asarray(row_roots(problem, 0, len(rows.times), colour_ratio(e))), jnp.asarray(onehot))  # fmt: skip
+             jnp.asarray(start_spread(stepper, e, 0)), jnp.asarray(padded(rows.readings, length, np.nan)),
+             jnp.asarray(row_roots(problem, 0, length, colour_ratio(e))), jnp.asarray(onehot))  # fmt: skip
     drawn = _run_draws(problem.equations, problem.integrator, course, jnp.asarray(_within(problem, zs)), fixed, ahead,
                        jax.random.split(state_key, _DRAWS))  # fmt: skip
     return _finite(np.asarray(drawn))

@@ -12,10 +12,13 @@ from ._calibrate import Priors, weights
 from ._evidence import Laplace, laplace
 from ._path import backward_lanes, forward_lanes
 from ._problem import Combination, Problem
+from ._stochastic import padded
 from ._trajectory import LANES, Stepper
 
 # Steps towards a smaller or larger reading noise are lengthened this much: plain EM is slow where noise is small.
 _HASTE = 1.5
+# A fit has converged when its log evidence moves by less than this many nats in a step.
+_SETTLED = 0.05
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,8 @@ def _fit_chunk(stepper, fits: list[PathFit], priors: Priors, rows: Sequence[int]
     for count in range(iterations):
         fits = _iterate(stepper, fits, priors, rows, weight, noisy=count < iterations - 2)
         now = np.array([fit.log_evidence for fit in fits])
-        settled = np.abs(now - before) < 0.02
+        with np.errstate(invalid="ignore"):
+            settled = np.abs(now - before) < _SETTLED
         if (settled | ~np.isfinite(now)).all():
             break
         before = now
@@ -73,8 +77,8 @@ def _iterate(stepper, fits: list[PathFit], priors: Priors, rows, weight, noisy: 
     for r, (linear, variances, done) in enumerate(passes):
         local = problem.local(r)
         back = backward_lanes(linear, done, variances, jnp.asarray(moved[:, local]))
-        shift = np.asarray(back.shift)
-        squares = squares + (weight[r] * np.asarray(back.noise)).sum(1)
+        shift = np.asarray(back.shift)[:, : rows[r]]
+        squares = squares + (weight[r] * np.asarray(back.noise)[:, : rows[r]]).sum(1)
         numbers = numbers + (weight[r] > 0).sum(0)
         for b, fit in enumerate(fits):
             paths[b].append(fit.paths[r] + shift[b])
@@ -94,21 +98,27 @@ def _next_noise(problem: Problem, noise: np.ndarray, expected: np.ndarray) -> np
 def _forward(stepper, fits: list[PathFit], r: int, rows: int, weight: np.ndarray):
     problem, f, head = stepper.problem, stepper.problem.calibrated.size, stepper.problem.head
     z = np.stack([fit.z for fit in fits])
-    inverse = np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0)
+    length = max(len(path) for fit in fits for path in fit.paths)
+    inverse = padded(np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0), length, 0.0)
     variances = jnp.asarray(np.stack([fit.noise**2 * inverse for fit in fits]))
     linear, done = forward_lanes(
         problem.equations,
         problem.integrator,
         stepper.courses[r],
-        jnp.asarray(np.stack([fit.paths[r][:rows] for fit in fits])),
+        jnp.asarray(np.stack([_prolonged(fit.paths[r], length) for fit in fits])),
         jnp.asarray(z[:, head : head + f]),
         jnp.asarray(z[:, head + f :]),
         jnp.asarray(np.stack([problem.onehot(fit.combination) for fit in fits])),
-        jnp.asarray(problem.rows[r].readings[:rows]),
+        jnp.asarray(padded(problem.rows[r].readings[:rows], length, np.nan)),
         variances,
         jnp.asarray(np.stack([fit.intensity for fit in fits])),
     )
     return linear, variances, done
+
+
+def _prolonged(path: np.ndarray, length: int) -> np.ndarray:
+    """A path that stays at its last phase point up to `length`; nothing is read there."""
+    return np.concatenate([path, np.repeat(path[-1:], length - len(path), axis=0)])
 
 
 def _integrated(problem: Problem, fit: PathFit, passes, priors: Priors, weight) -> Laplace:

@@ -58,7 +58,7 @@ class Outlook:
         e, r = self.estimate, self.recording
         return run_filter(
             self.stepper.problem, self.stepper.courses[r], r, e.z, e.combination, total_noise(e), colour_ratio(e),
-            self.intensity, start_spread(self.stepper, e, r), len(self.rows.times), self.rows.fitted,
+            self.intensity, start_spread(self.stepper, e, r), self.rows.fitted,
         )  # fmt: skip
 
     @property
@@ -78,14 +78,13 @@ class Outlook:
         if self.ok:
             return np.asarray(self._filtered[1].filtered_means[last])
         part = slice(self.recording * self.stepper.problem.state, (self.recording + 1) * self.stepper.problem.state)
-        return np.asarray(self._run(self.estimate.z[part], slice(0, last + 1))[1][-1])
+        return self._run(self.estimate.z[part], 0)[1][last]
 
     @cached_property
     def readings(self) -> Float[np.ndarray, "time channel"]:
         """Filtered readings over the fitted rows, then the free run."""
         last = self.rows.fitted - 1
-        run = np.asarray(self._run(self.last_state, slice(last, len(self.rows.times)))[0])
-        return np.concatenate([self.followed[:last], run])
+        return np.concatenate([self.followed[:last], self._run(self.last_state, last)[0]])
 
     @cached_property
     def followed(self) -> Float[np.ndarray, "fitted channel"]:
@@ -123,7 +122,7 @@ class Outlook:
         """Sum over held-out rows of the log density of each reading around the free run, with the filter's spread."""
         first = self.rows.fitted
         weight = self._roots()[first:] ** 2
-        S = np.asarray(self._filtered[1].innovation_covariances[first:])
+        S = np.asarray(self._filtered[1].innovation_covariances[first : len(self.rows.times)])
         variance = np.diagonal(S, axis1=1, axis2=2) / weight
         error = self.rows.readings[first:] - self.readings[first:]
         seen = ~np.isnan(error)
@@ -146,6 +145,6 @@ class Outlook:
         series = np.asarray(self.smoothed.standardised_disturbances[: n - 1, d:])
         return np.concatenate([series, series[-1:]])
 
-    def _run(self, x: np.ndarray, rows: slice) -> Any:
+    def _run(self, x: np.ndarray, start: int) -> Any:
         p, e = self.stepper.problem, self.estimate
-        return free_run(p, self.stepper.courses[self.recording], e.z, e.combination, self.recording, x, rows)
+        return free_run(p, self.stepper.courses[self.recording], e.z, e.combination, self.recording, x, start)

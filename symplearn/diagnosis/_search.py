@@ -133,7 +133,7 @@ class Search:
         span = float(np.median(np.diff(problem.rows[r].times)))
         intensity = np.maximum(force, np.abs(force).max() * 1e-3) ** 2 * span * 10
         _, filtered = run_filter(problem, course, r, z, (), noise, 0 * noise, intensity, spread, self.rows[r])
-        means = np.array(filtered.filtered_means)
+        means = np.array(filtered.filtered_means[: self.rows[r]])
         means[0] = x
         return means if bool(filtered.ok) else np.tile(x, (self.rows[r], 1))
 
@@ -202,7 +202,7 @@ class Search:
 
     @property
     def _path_steps(self) -> int:
-        return 6 if self._long else 10
+        return 8 if self._long else 16
 
     def _first_part(self, growing: list[list[int]]) -> int:
         """How many of the growing windows are affordable for every combination."""

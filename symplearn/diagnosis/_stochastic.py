@@ -75,14 +75,21 @@ def _smooth(model, filtered, spans, contexts):
     return smooth(model, filtered, spans, contexts)
 
 
-def row_roots(problem: Problem, recording: int, rows: int, ratio: Float[np.ndarray, " channel"]) -> np.ndarray:
+def row_roots(problem: Problem, recording: int, length: int, ratio: Float[np.ndarray, " channel"]) -> np.ndarray:
     """Square root of each row's information in units of one reading's (time, channel); 1 where there is none.
 
-    `ratio` is the variance of a coloured error over the white one: averaging rows does not make it smaller.
+    `ratio` is the variance of a coloured error over the white one: averaging rows does not make it smaller. Rows up
+    to `length` are filled in.
     """
-    counts = problem.rows[recording].counts[:rows]
+    counts = padded(problem.rows[recording].counts, length, 0.0)
     white = np.where(counts > 1, THINNED / np.where(counts > 1, counts, 1.0), 1.0)
     return np.sqrt((1.0 + ratio) / (white + ratio))
+
+
+def padded(values: Float[np.ndarray, "time ..."], length: int, fill: float) -> Float[np.ndarray, "length ..."]:
+    """Rows up to `length`, so that recordings of every length share one compiled function."""
+    lack = [(0, max(0, length - len(values)))] + [(0, 0)] * (values.ndim - 1)
+    return np.pad(values, lack, constant_values=fill)[:length]
 
 
 def softness(problem: Problem, course: Course, z: np.ndarray, recording: int) -> np.ndarray:
@@ -103,16 +110,15 @@ def run_filter(
     ratio: Float[np.ndarray, " channel"],
     intensity: Float[np.ndarray, " d"],
     spread: Float[np.ndarray, "state state"],
-    rows: int,
-    seen: int | None = None,
+    seen: int,
 ) -> tuple[Any, Filtered]:
-    """Filter the first `rows` rows from the phase point in `z` with covariance `spread`; also returns its inputs.
+    """Filter a recording from the phase point in `z` with covariance `spread`; also returns what the filter was given.
 
-    Readings from row `seen` on are hidden from the filter.
+    Readings from row `seen` on are hidden; rows beyond the recording's own are padding.
     """
+    length = course.times.shape[0]
     onehot, head, f = problem.onehot(combination), problem.head, problem.calibrated.size
-    readings = problem.rows[recording].readings[:rows].copy()
-    readings[seen if seen is not None else rows :] = np.nan
+    readings = padded(problem.rows[recording].readings[:seen], length, np.nan)
     model, spans, contexts, filtered = _filter(
         problem.equations,
         problem.integrator,
@@ -125,7 +131,7 @@ def run_filter(
         jnp.asarray(z[recording * problem.state : (recording + 1) * problem.state]),
         jnp.asarray(spread),
         jnp.asarray(readings),
-        jnp.asarray(row_roots(problem, recording, rows, ratio)),
+        jnp.asarray(row_roots(problem, recording, length, ratio)),
     )
     return (model, spans, contexts), filtered
 
@@ -137,28 +143,31 @@ def run_smoother(parts: Any, filtered: Filtered) -> Smoothed:
 
 
 def free_run(
-    problem: Problem, course: Course, z: np.ndarray, combination: Combination, recording: int, x: Any, rows: slice
-) -> tuple[Float[Array, "time channel"], Float[Array, "time state"]]:
-    """Readings and phase points over `rows` of a run that starts from `x` at the first of them and looks at nothing."""
+    problem: Problem, course: Course, z: np.ndarray, combination: Combination, recording: int, x: Any, start: int
+) -> tuple[Float[np.ndarray, "time channel"], Float[np.ndarray, "time state"]]:
+    """Readings and phase points from row `start` on of a run that begins at `x` there and looks at no reading."""
     coefficients = problem.coefficients(recording, z, combination) - problem.coefficients(recording, z, ())
     head, f = problem.head, problem.calibrated.size
-    part = jax.tree.map(lambda leaf: leaf[rows], (course.spans, course.times, course.inputs))
-    return _run(
+    readings, states = _run(
         problem.equations,
         problem.integrator,
-        eqx.tree_at(lambda c: (c.spans, c.times, c.inputs), course, part),
+        course,
         jnp.asarray(z[head : head + f]),
         jnp.asarray(coefficients),
         jnp.asarray(x),
+        jnp.asarray(start),
     )
+    rows = slice(start, len(problem.rows[recording].times))
+    return np.asarray(readings)[rows], np.asarray(states)[rows]
 
 
 @eqx.filter_jit
-def _run(equations: Any, integrator: ig.AbstractIntegrator, course: Course, calibrated, coefficients, x):
+def _run(equations: Any, integrator: ig.AbstractIntegrator, course: Course, calibrated, coefficients, x, start):
     flow, read = model_at(equations, integrator, course, calibrated, coefficients)
 
     def step(x, row):
-        span, t, inputs = row
-        return flow(x, span), (read(x, (t, inputs)), x)
+        k, span, t, inputs = row
+        return jnp.where(k >= start, flow(x, span), x), (read(x, (t, inputs)), x)
 
-    return jax.lax.scan(step, x, (course.spans, course.times, course.inputs))[1]
+    places = jnp.arange(course.times.shape[0])
+    return jax.lax.scan(step, x, (places, course.spans, course.times, course.inputs))[1]

@@ -1,0 +1,224 @@
+"""Paths under a white missing force: on a linear oscillator, one dense Gaussian that everything is read from."""
+
+from dataclasses import replace
+
+import engine_cases as cases
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.stats import multivariate_normal
+
+from symplearn.diagnosis._calibrate import calibrate
+from symplearn.diagnosis._noisy import PathFit, fit_paths
+from symplearn.diagnosis._start import priors_without_effects
+from symplearn.diagnosis._trajectory import Stepper
+from symplearn.diagnosis._weighed import weigh_white
+
+MASS, STIFFNESS, NOISE = 2.0, 3.0, 0.05
+X0_MEAN, X0_SD = np.array([0.9, 0.1]), np.array([0.3, 0.5])
+PULL_MEAN, PULL_SD = 0.2, 0.4
+SCALE = 0.25  # prior sd of every effect
+N = 25
+INTENSITY = 0.02
+
+FILE = f"""
+[parameters]
+k = {STIFFNESS}
+f = {{ value = {PULL_MEAN}, sd = {PULL_SD} }}
+
+[initial]
+q = {{ value = {X0_MEAN[0]}, sd = {X0_SD[0]} }}
+p = {{ value = {X0_MEAN[1]}, sd = {X0_SD[1]} }}
+
+[recording.noise]
+y = {NOISE}
+"""
+
+
+def made(seed):
+    """Irregular times, some readings missing, of a motion that a force unknown to anyone disturbs."""
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(rng.uniform(0.15, 0.25, N))
+    rates = lambda t, x: [x[1] / MASS, -STIFFNESS * x[0] + 0.3 + 0.2 * np.sin(3.1 * t + seed)]  # noqa: E731
+    readings = cases.solved(rates, [1.0, 0.0], times)[:, 0] + 0.1 + NOISE * rng.normal(size=N)
+    readings[[4, 5, 11]] = np.nan
+    return cases.recorded(times, readings)
+
+
+@pytest.fixture(scope="module")
+def stepper():
+    file = cases.simulation(f"p**2/(2*{MASS}) + k*q**2/2 - f*q", more=FILE)
+    # Suzuki's method at a thirtieth of the period over 2 pi is exact to 1e-8 over these times.
+    return Stepper(cases.problem(file, [made(0), made(1)], 0.02))
+
+
+@pytest.fixture(scope="module")
+def priors(stepper):
+    candidates = stepper.problem.equations.candidates
+    return replace(priors_without_effects(stepper.problem), scales=np.full(len(candidates), SCALE))
+
+
+def place(problem, effect):
+    return next(i for i, c in enumerate(problem.equations.candidates) if c.effect.name == effect)
+
+
+def effects(problem):
+    """A force and a bias: both linear, so that nothing is approximated."""
+    return (place(problem, "constant_force"), place(problem, "sensor_bias"))
+
+
+class Dense:
+    """Everything by one Gaussian over [x_0 of both runs, f, constant force, bias, all white forces]."""
+
+    def __init__(self, problem, intensity, named):
+        runs, unknowns = problem.rows, 2 * len(problem.rows) + (3 if named else 1)
+        columns = unknowns + sum(2 * (len(r.times) - 1) for r in runs)
+        mean, variance = np.zeros(columns), np.zeros((columns, columns))
+        mean[:4], mean[4] = np.tile(X0_MEAN, 2), PULL_MEAN
+        variance[range(4), range(4)] = np.tile(X0_SD**2, 2)
+        variance[4, 4] = PULL_SD**2
+        if named:
+            variance[5, 5] = variance[6, 6] = SCALE**2
+        first, rows, states, ys = unknowns, [], [], []
+        for r, run in enumerate(runs):
+            x = np.zeros((2, columns))
+            x[:, 2 * r : 2 * r + 2] = np.eye(2)
+            for k, y in enumerate(run.readings[:, 0]):
+                states.append(x)
+                if not np.isnan(y):
+                    row = x[0].copy()
+                    row[6 : 7 if named else 6] += 1.0
+                    rows.append(row)
+                    ys.append(y)
+                if k + 1 < len(run.times):
+                    gap = run.times[k + 1] - run.times[k]
+                    A, b = _flow(gap)
+                    x = A @ x
+                    x[:, 4] += b
+                    if named:
+                        x[:, 5] += b
+                    x[:, first : first + 2] = np.eye(2)
+                    variance[first : first + 2, first : first + 2] = _simpson(A, intensity, gap)
+                    first += 2
+        H, states = np.array(rows), np.array(states)
+        self.H, self.m0, self.v0, self.ys = H, mean, variance, np.array(ys)
+        S = H @ variance @ H.T + NOISE**2 * np.eye(len(ys))
+        self.log_evidence = multivariate_normal.logpdf(ys, H @ mean, S)
+        gain = variance @ H.T @ np.linalg.inv(S)
+        self.mean = mean + gain @ (ys - H @ mean)
+        self.covariance = variance - gain @ H @ variance
+        self.unknowns = unknowns
+        self.paths = np.split(states @ self.mean, len(runs))
+
+
+def _flow(gap):
+    """x' = M x + (0, 1) f over a gap, exactly: the matrix exponential of the enlarged system."""
+    M = np.array([[0, 1 / MASS, 0], [-STIFFNESS, 0, 1], [0, 0, 0]])
+    whole = expm(M * gap)
+    return whole[:2, :2], whole[:2, 2]
+
+
+def _simpson(A, intensity, gap):
+    """The integral of F e e' F' intensity over the gap by Simpson, F = A, (1 + A)/2, 1 at its beginning, middle, end."""
+    e = np.array([0.0, 1.0])
+    ends = [A @ e, 0.5 * (e + A @ e), e]
+    return gap / 6 * intensity * sum(w * np.outer(x, x) for w, x in zip((1, 4, 1), ends, strict=True))
+
+
+def start(problem, intensity, combination, seed=0):
+    """A path that is wrong everywhere, to start from."""
+    rng = np.random.default_rng(seed)
+    z = np.zeros(problem.size)
+    z[:4], z[4] = [0.8, 0.3, 0.7, -0.2], -0.1
+    paths = [rng.normal(size=(N, 2)) for _ in problem.rows]
+    for r, path in enumerate(paths):
+        path[0] = z[2 * r : 2 * r + 2]
+    return PathFit(combination, np.array([intensity]), z, np.array([NOISE]), paths)
+
+
+@pytest.fixture(scope="module")
+def fits(stepper, priors):
+    """Two intensities, without and with effects, side by side."""
+    p = stepper.problem
+    starts = [start(p, q, c) for q in (INTENSITY, 1.0) for c in ((), effects(p))]
+    return fit_paths(stepper, starts, priors, [N, N])
+
+
+LANES = pytest.mark.parametrize(
+    ("lane", "intensity", "named"), [(0, INTENSITY, False), (1, INTENSITY, True), (2, 1.0, False), (3, 1.0, True)]
+)
+
+
+@LANES
+def test_the_log_evidence_is_the_dense_marginal_likelihood(stepper, fits, lane, intensity, named):
+    """Readings of two runs, priors of states, parameter and effects included, missing readings left out."""
+    expected = Dense(stepper.problem, intensity, named).log_evidence
+    # The composed leapfrog is off by 1e-8 a step, a thousandth of a nat at the very most.
+    np.testing.assert_allclose(fits[lane].log_evidence, expected, atol=1e-4)
+    assert fits[lane].converged
+
+
+@LANES
+def test_unknowns_and_their_covariance_are_the_dense_posterior(stepper, fits, lane, intensity, named):
+    """Initial states, parameter and effects, and how well they are known, equal Gaussian conditioning."""
+    dense, n = Dense(stepper.problem, intensity, named), 7 if named else 5
+    np.testing.assert_allclose(fits[lane].z[:n], dense.mean[:n], atol=1e-5)
+    np.testing.assert_allclose(fits[lane].laplace.covariance[:n, :n], dense.covariance[:n, :n], atol=1e-6)
+
+
+@LANES
+def test_the_path_is_the_dense_smoothers(stepper, fits, lane, intensity, named):
+    """The most probable path equals the mean of every phase point given all readings, even across missing ones."""
+    dense = Dense(stepper.problem, intensity, named)
+    for found, expected in zip(fits[lane].paths, dense.paths, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_without_a_force_it_is_the_trajectory_fit(stepper, priors):
+    """As the intensity goes to zero, evidence, unknowns and covariance tend to those of the trajectory fit."""
+    p = stepper.problem
+    combinations = [(), effects(p)]
+    begin = np.stack([start(p, 0.0, c).z for c in combinations])
+    trajectories = calibrate(stepper, begin, combinations, priors, [N, N], tolerance=1e-10)
+    white = weigh_white(p, trajectories, priors, [N, N])
+    quiet = fit_paths(stepper, [start(p, 1e-14, c) for c in combinations], priors, [N, N])
+    for expected, found in zip(white, quiet, strict=True):
+        # What the force adds to the readings' variance is 1e-14 times some time cubed, over 2.5e-3.
+        np.testing.assert_allclose(found.log_evidence, expected.log_evidence, atol=1e-6)
+        np.testing.assert_allclose(found.z, expected.z, atol=1e-6)
+        np.testing.assert_allclose(found.laplace.covariance, expected.covariance, atol=1e-7)
+
+
+def test_the_trajectory_fits_evidence_is_the_dense_one(stepper, priors):
+    """`weigh_white` is the dense marginal likelihood without any process noise."""
+    p = stepper.problem
+    combinations = [(), effects(p)]
+    begin = np.stack([start(p, 0.0, c).z for c in combinations])
+    fits = calibrate(stepper, begin, combinations, priors, [N, N], tolerance=1e-10)
+    for one, named in zip(weigh_white(p, fits, priors, [N, N]), (False, True), strict=True):
+        np.testing.assert_allclose(one.log_evidence, Dense(p, 0.0, named).log_evidence, atol=1e-4)
+
+
+def test_a_nonlinear_path_is_a_fixed_point(stepper, priors):
+    """With viscous damping, which multiplies the state, the fit still settles, and settles at one place."""
+    p = stepper.problem
+    chosen = (place(p, "viscous_damping"),)
+    one, other = fit_paths(stepper, [start(p, INTENSITY, chosen, s) for s in (1, 2)], priors, [N, N], 20)
+    assert one.converged and other.converged
+    # Evidence settles to 0.02; what is left of a Gauss-Newton step is its square.
+    np.testing.assert_allclose(one.log_evidence, other.log_evidence, atol=0.02)
+    np.testing.assert_allclose(one.z, other.z, atol=0.01)
+
+
+def test_an_unknown_noise_is_estimated(stepper, priors):
+    """Where the file does not give it, the reading noise becomes the one with the largest dense likelihood."""
+    p = replace(stepper.problem, noise=np.array([np.nan]))
+    blind = Stepper.__new__(Stepper)
+    blind.problem, blind.courses, blind.jobs = p, stepper.courses, 1
+    first = replace(start(p, INTENSITY, ()), noise=np.array([0.2]))
+    (found,) = fit_paths(blind, [first], priors, [N, N], 60)
+    nearby = [fit_paths(stepper, [replace(first, noise=found.noise * s)], priors, [N, N])[0].log_evidence
+              for s in (0.9, 1.0, 1.1)]  # fmt: skip
+    # Expectation-maximisation leaves the noise where the likelihood of noise and path together is flat.
+    assert nearby[1] > nearby[0] - 0.3 and nearby[1] > nearby[2] - 0.3
+    assert 0.5 * NOISE < found.noise[0] < 2 * NOISE

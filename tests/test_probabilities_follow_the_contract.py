@@ -1,0 +1,174 @@
+"""Prior prices and posterior probabilities are those of the contract (section 4)."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import engine_cases as cases
+import numpy as np
+import pytest
+
+from symplearn._effects import prices, vocabulary
+from symplearn.diagnosis._calibrate import Priors
+from symplearn.diagnosis._posterior import posterior
+from symplearn.diagnosis._search import Found
+from symplearn.diagnosis._weighed import Estimate
+
+# Sums of a few dozen numbers below one.
+ROUND_OFF = 1e-12
+
+# By hand from the contract: families conservative, dissipation, sensor and `any` (what has no name) share equally,
+# then the effects of a family, then the two coordinates or the two columns.
+FAMILIES = 4
+EFFECTS = {"conservative": 4, "dissipation": 3, "sensor": 2}
+
+
+@pytest.fixture(scope="module")
+def problem():
+    file = cases.simulation("(p1**2 + p2**2 + q1**2 + q2**2)/2", ["q1", "q2"], ["p1", "p2"], {"a": "q1", "b": "q2"})
+    return cases.problem(file, [cases.recorded(np.arange(10.0), np.ones((10, 2)))], 1.0)
+
+
+def place(problem, effect, target):
+    return next(i for i, c in enumerate(problem.equations.candidates) if c.key == (effect, target))
+
+
+def estimate(problem, combination, log_evidence, kind="white", sd=0.01):
+    """A hand-made record: every coefficient known to `sd`, in units of its prior's."""
+    covariance = np.diag(np.full(problem.size, sd**2))
+    nothing, noise = np.zeros(problem.size), np.ones(problem.channels)
+    return Estimate(combination, kind, nothing, covariance, noise, log_evidence, True)
+
+
+def found(problem, *estimates):
+    zero, ones = np.zeros(problem.size), np.ones(len(problem.equations.candidates))
+    out = Found(Priors(zero, zero, ones))
+    for one in estimates:
+        out.add(one)
+    return out
+
+
+def singles(problem):
+    return [(c,) for c in problem.searched]
+
+
+def price(problem, candidate):
+    family = problem.equations.candidates[candidate].effect.family
+    return 1 / (FAMILIES * EFFECTS[family] * 2)
+
+
+def test_every_effect_on_every_target_is_in_the_vocabulary(problem):
+    """Two coordinates and two columns have 2 x 7 effects of the dynamics and 2 x 2 of the sensor, none twice."""
+    keys = [c.key for c in problem.equations.candidates]
+    assert len(set(keys)) == len(keys) == 2 * 7 + 2 * 2
+    assert {t for e, t in keys if e.startswith("sensor")} == {"a", "b"}
+    assert {t for e, t in keys if not e.startswith("sensor")} == {"q1", "q2"}
+
+
+def test_prices_are_shared_by_families_then_effects_then_targets(problem):
+    """Each price is 1 / (families x effects of its family x targets), and with the unexplained they sum to one."""
+    candidates = problem.equations.candidates
+    found = prices(candidates, ["any", "conservative", "dissipation", "sensor"])
+    for index in range(len(candidates)):
+        assert found[index] == pytest.approx(price(problem, index), rel=ROUND_OFF)
+    assert sum(found.values()) + 1 / FAMILIES == pytest.approx(1.0, rel=ROUND_OFF)
+
+
+def test_a_narrower_search_shares_among_what_is_left():
+    """With one effect of a family left on two targets, its family's share is halved and no more."""
+    candidates = [c for c in vocabulary(["q1", "q2"], ["a"]) if c.effect.name in ("viscous_damping", "sensor_bias")]
+    found = prices(candidates, ["any", "dissipation", "sensor"])
+    assert [found[i] for i in range(3)] == pytest.approx([1 / 6, 1 / 6, 1 / 3], rel=ROUND_OFF)
+
+
+@pytest.mark.parametrize("value", [0.0, -1234.5, 5678.9])
+def test_equal_evidences_give_the_prior_back(problem, value):
+    """Where every hypothesis explains alike: 1/2 for nothing, 1/8 for the unexplained, its price / 2 for each effect."""
+    fits = [estimate(problem, (), value, kind) for kind in ("white", "coloured", "force")]
+    fits += [estimate(problem, c, value) for c in singles(problem)]
+    p = posterior(problem, found(problem, *fits), 1.0)
+    # Evidences of some thousands keep twelve digits behind the point.
+    assert p.as_it_is == pytest.approx(0.5, rel=1e-9)
+    assert p.unexplained == pytest.approx(0.5 / FAMILIES, rel=1e-9)
+    for w in p.named:
+        assert w.probability == pytest.approx(0.5 * price(problem, w.combination[0]), rel=1e-9)
+
+
+def test_probabilities_add_to_one_and_come_likeliest_first(problem):
+    """With arbitrary evidences of all singles and pairs under every kind of remainder."""
+    rng = np.random.default_rng(0)
+    everything = [(), *singles(problem), *combinations(problem.searched, 2)]
+    fits = [estimate(problem, c, 4 * rng.normal(), kind) for c in everything for kind in ("white", "coloured", "force")]
+    p = posterior(problem, found(problem, *fits), 1.0)
+    named = [w.probability for w in p.named]
+    assert p.as_it_is + p.unexplained + sum(named) == pytest.approx(1.0, rel=ROUND_OFF)
+    assert named == sorted(named, reverse=True) and len(named) == 18 + 18 * 17 // 2
+
+
+def test_a_combination_pays_every_members_price(problem):
+    """Odds of a pair against nothing are the product of two prices, times the ratio of evidences."""
+    pair = (place(problem, "viscous_damping", "q1"), place(problem, "sensor_gain", "b"))
+    p = posterior(problem, found(problem, estimate(problem, (), -3.0), estimate(problem, pair, 2.0)), 1.0)
+    odds = p.named[0].probability / p.as_it_is
+    assert odds == pytest.approx(1 / 24 * 1 / 16 * np.exp(5.0), rel=1e-9)
+
+
+def test_a_remainder_beside_a_finding_costs_its_familys_share(problem):
+    """An effect with a remainder is weighed as the effect alone is, at the price of `any`, shared by its kinds."""
+    one = (place(problem, "viscous_damping", "q1"),)
+    kinds = [estimate(problem, one, value, kind) for kind, value in (("white", 0.0), ("coloured", 3.0), ("force", 1.0))]
+    p = posterior(problem, found(problem, estimate(problem, (), 0.0), *kinds), 1.0)
+    expected = 1 / 24 * (1 + 1 / FAMILIES * (np.exp(3.0) + np.exp(1.0)) / 2)
+    assert p.named[0].probability / p.as_it_is == pytest.approx(expected, rel=1e-9)
+    assert p.named[0].best.kind == "coloured"
+
+
+def test_what_the_recording_says_nothing_of_is_not_weighed(problem):
+    """An effect whose posterior is as wide as its prior is left out, and so is a pair that holds one."""
+    known, blind = place(problem, "viscous_damping", "q1"), place(problem, "linear_stiffness", "q2")
+    fits = [estimate(problem, (), 0.0), estimate(problem, (known,), 0.0), estimate(problem, (blind,), 9.0, sd=0.95)]
+    pair = tuple(sorted((known, blind)))
+    both = estimate(problem, pair, 9.0)
+    slot = problem.head + problem.calibrated.size + pair.index(blind)
+    wide = both.covariance.copy()
+    wide[slot, slot] = 0.9
+    p = posterior(problem, found(problem, *fits, replace(both, covariance=wide)), 1.0)
+    assert [w.combination for w in p.named] == [(known,)]
+    assert p.as_it_is + p.unexplained + p.named[0].probability == pytest.approx(1.0, rel=ROUND_OFF)
+
+
+def test_how_wide_is_measured_in_each_effects_own_prior(problem):
+    """A spread of 0.9 is known well beside a prior of 10 and not at all beside one of 1."""
+    one = place(problem, "cubic_stiffness", "q1")
+    fits = found(problem, estimate(problem, (), 0.0), estimate(problem, (one,), 0.0, sd=0.9))
+    assert not posterior(problem, fits, 1.0).named
+    scales = fits.priors.scales.copy()
+    scales[one] = 10.0
+    fits.priors = replace(fits.priors, scales=scales)
+    assert len(posterior(problem, fits, 1.0).named) == 1
+
+
+def test_a_remainder_that_is_not_white_tempers_every_evidence(problem):
+    """At an inflation of 4 the log odds of evidence are a quarter; what chance does to white rows tempers nothing."""
+    one = (place(problem, "coulomb_friction", "q2"),)
+    fits = found(problem, estimate(problem, (), -20.0), estimate(problem, one, 0.0))
+    for inflation, evidence in ((4.0, 5.0), (1.5, 20.0), (1.0, 20.0)):
+        p = posterior(problem, fits, inflation)
+        assert np.log(p.named[0].probability / p.as_it_is) == pytest.approx(np.log(1 / 24) + evidence, rel=1e-9)
+        assert p.tempered == pytest.approx(evidence / 20.0)
+
+
+def test_a_fit_that_failed_has_no_probability(problem):
+    """A combination of evidence minus infinity is not weighed, and nothing becomes NaN."""
+    one, other = singles(problem)[:2]
+    fits = [estimate(problem, (), 0.0), estimate(problem, one, -np.inf), estimate(problem, other, 1.0)]
+    p = posterior(problem, found(problem, *fits), 1.0)
+    assert [w.combination for w in p.named] == [other]
+    assert p.unexplained == 0.0 and p.as_it_is + p.named[0].probability == pytest.approx(1.0)
+
+
+def test_of_two_estimates_of_one_kind_the_better_counts(problem):
+    """Fits from two starts do not count twice: the larger evidence stays, in whichever order they came."""
+    one = singles(problem)[0]
+    for values in ((1.0, 2.0), (2.0, 1.0)):
+        kept = found(problem, *(estimate(problem, one, v) for v in values))
+        assert kept.best(one) == 2.0 and len(kept.estimates[one]) == 1
