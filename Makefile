@@ -27,11 +27,11 @@ test-recordings: $(VENV)/project.stamp ## the tests on real recordings, which fa
 # Two stamps: a new lock makes the environment anew, a new pyproject.toml only installs the project again.
 # A stamp is the last thing written, so an interrupted run starts over.
 $(VENV)/lock.stamp: requirements.lock
-	@python=; for candidate in python3.12 python3.11 python3; do \
+	@python=; for candidate in python3.12 python3.11 python3 python3.13; do \
 	    if "$$candidate" -c '$(USABLE)' >/dev/null 2>&1; then python=$$candidate; break; fi; \
 	done; \
 	if [ -z "$$python" ]; then \
-	    echo "symplearn needs Python 3.11, 3.12 or 3.13 with its venv module (on Debian: python3-venv) as" \
+	    echo "symplearn needs Python 3.11 or newer with its venv module (on Debian: python3-venv) as" \
 	        "python3.12, python3.11 or python3 on the PATH." >&2; \
 	    exit 1; \
 	fi; \
@@ -40,7 +40,7 @@ $(VENV)/lock.stamp: requirements.lock
 	@$(PIP) install --only-binary :all: --require-hashes -r requirements.lock
 	@touch $@
 
-USABLE = import ensurepip, sys, venv; sys.exit(not (3, 11) <= sys.version_info < (3, 14))
+USABLE = import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))
 
 $(VENV)/project.stamp: $(VENV)/lock.stamp pyproject.toml
 	@$(PIP) install --no-deps --no-build-isolation --editable .

@@ -84,7 +84,9 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "simulation.toml").write_text(SIMULATION, encoding="utf-8")
     (folder / "recording.csv").write_text(recording(), encoding="utf-8")
-    print(f"Wrote {folder}: damping {DAMPING} N m s displaces {concealed():.0%} of the readings by less than the noise.")
+    print(
+        f"Wrote {folder}: damping {DAMPING} N m s displaces {concealed():.0%} of the readings by less than the noise."
+    )
 
 
 if __name__ == "__main__":

@@ -124,20 +124,23 @@ class SimulatedHamiltonian(ig.AbstractHamiltonian):
         return SimulatedHamiltonian(self.equations, self.parameters, self.inputs, jnp.asarray(t), self.coefficients)
 
     def kick(
-        self, q: Float[Array, " d"], p: Float[Array, " d"], dt: Float[Array, ""]
+        self, q: Float[Array, " d"], p: Float[Array, " d"], dt: Float[Array, ""], ahead: float = 1.0
     ) -> tuple[Float[Array, " d"], Bool[Array, " d"]]:
         """The momentum after the forces that depend on velocity have acted for `dt` at frozen q, and what stuck.
 
-        Smooth drag by the explicit midpoint rule. Dry friction by its exact flow for a kinetic energy quadratic in
-        each momentum: it takes the velocity towards zero and no further.
+        Smooth drag by the explicit midpoint rule. Dry friction by the mean sign of the velocity over the time that
+        the kick stands for, which lies `ahead` (1) or behind (-1): a sign taken at one instant would make the
+        trajectory jump with the starting values. Where friction can hold every other force, it stops the motion.
+        Exact for a kinetic energy quadratic in each momentum.
         """
         half = p + 0.5 * dt * self._smooth(q, p)
         p = p + dt * self._smooth(q, half)
-        friction = self.coefficients[jnp.asarray(self.equations.drags[2])] * dt
-        arguments = self.arguments(q, p)
-        stop = self.equations.velocity(arguments) / self.equations.softness(arguments)
-        stuck = (friction > 0) & (jnp.abs(stop) <= friction)
-        return p - jnp.where(stuck, stop, friction * jnp.sign(stop)), stuck
+        friction = self.coefficients[jnp.asarray(self.equations.drags[2])]
+        v, acceleration = jax.jvp(self.velocity, (q, p), (self.velocity(q, p), -self.slope(q, p)))
+        softness = self.equations.softness(self.arguments(q, p))
+        stop = v / softness
+        held = (friction > 0) & (jnp.abs(stop) <= friction * dt) & (jnp.abs(acceleration) <= friction * softness)
+        return p - jnp.where(held, stop, friction * dt * _mean_sign(v, v + ahead * dt * acceleration)), held
 
     def _smooth(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
         arguments = self.arguments(q, p)
@@ -145,6 +148,13 @@ class SimulatedHamiltonian(ig.AbstractHamiltonian):
         viscous, quadratic = (self.coefficients[jnp.asarray(place)] for place in self.equations.drags[:2])
         force = -(viscous + quadratic * jnp.abs(v)) * v
         return force if self.equations.kick is None else force + self.equations.kick(arguments)
+
+
+def _mean_sign(begin: Float[Array, " d"], end: Float[Array, " d"]) -> Float[Array, " d"]:
+    """Mean of the sign of what goes evenly from `begin` to `end`: (|end| - |begin|) / (end - begin)."""
+    crosses = begin * end < 0
+    change = jnp.where(crosses, end - begin, 1.0)
+    return jnp.where(crosses, (jnp.abs(end) - jnp.abs(begin)) / change, jnp.sign(begin + end))
 
 
 class Span(eqx.Module):
@@ -185,7 +195,7 @@ class SimulatedFlow(eqx.Module):
         p, held = system.at(t + 0.25 * dt).kick(q, p, 0.5 * dt)
         state = self.integrator.lift(jnp.concatenate([q, p]))
         moved, p = ig.split(self.integrator.project(self.integrator.flow(system, state, t, dt)))
-        p, stuck = system.at(t + 0.75 * dt).kick(moved, p, 0.5 * dt)
+        p, stuck = system.at(t + 0.75 * dt).kick(moved, p, 0.5 * dt, ahead=-1.0)
         # Held at both ends: without this a body at rest would creep through the flow in between.
         return jnp.concatenate([jnp.where(held & stuck, q, moved), p])
 

@@ -1,27 +1,30 @@
 """The `symplearn` command."""
 
+import atexit
 import os
+import shutil
 import sys
 import tempfile
 import time
 from importlib import resources
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
+from typer.exceptions import TyperException
 
-from ._errors import InputError
+from ._errors import InputError, printable
 
 app = typer.Typer(
     name="symplearn",
     help="Say what physics a simulation left out, from recordings that disagree with it.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
 _CORES = os.cpu_count() or 1
+_STOPPED = 130  # by Ctrl-C, as a shell says it
 _Positive = Annotated[int, typer.Option(min=1, help="Threads; the answer does not depend on it.")]
 
 
@@ -30,7 +33,7 @@ def diagnose(
     simulation: Annotated[Path, typer.Argument(help="The simulation file (TOML).", show_default=False)],
     recordings: Annotated[list[Path], typer.Argument(help="Recordings (CSV, .csv.gz).", show_default=False)],
     out: Annotated[Path, typer.Option(help="Folder that the report is written to.")] = Path("diagnosis"),
-    seed: Annotated[int, typer.Option(help="Same seed, same files: same answer.")] = 0,
+    seed: Annotated[int, typer.Option(min=-(2**63), max=2**63 - 1, help="Same seed, same files: same answer.")] = 0,
     holdout: Annotated[float, typer.Option(help="Last part of each recording, kept from every fit.")] = 0.25,
     forecast_until: Annotated[float | None, typer.Option(help="Forecast up to this time.")] = None,
     forecast_step: Annotated[float | None, typer.Option(help="Spacing of the forecast.")] = None,
@@ -54,6 +57,7 @@ def diagnose(
     if forecast_step is not None and forecast_until is None:
         raise InputError("--forecast-step: needs --forecast-until; give the time to forecast to")
     _prepare(cache)
+    from ._effects import EFFECTS
     from ._recording import read_recordings
     from ._simulation_file import read_simulation
     from .diagnosis import Options, restriction_of
@@ -61,6 +65,10 @@ def diagnose(
     from .report import prepare_directory, summary, write_outputs
 
     restriction = restriction_of(effects, sensor_only, dynamics_only)
+    sensors = {EFFECTS[name].family == "sensor" for name in restriction.effects or ()}
+    if sensors == {dynamics_only} and sensor_only != dynamics_only:
+        flag = "--sensor-only" if sensor_only else "--dynamics-only"
+        raise InputError(f"{flag}: leaves none of the --effects to search; drop one of the two")
     file = read_simulation(simulation)
     read = read_recordings(file, recordings)
     folder = prepare_directory(out)
@@ -120,7 +128,7 @@ class _Progress:
         passed = time.monotonic() - self._begin
         if self._status:
             self._status.update(f"{passed:4.0f} s  {message}")
-        else:
+        elif passed > 1.0:
             self._console.print(f"{passed:6.1f} s  {message}", markup=False, highlight=False)
 
 
@@ -131,11 +139,19 @@ def _prepare(cache: bool) -> None:
     jax.config.update("jax_enable_x64", True)
     folder = _private_folder() if cache else None
     # Left to itself matplotlib keeps its font list in a folder of its own.
-    fonts = str(folder / "matplotlib") if folder else tempfile.mkdtemp(prefix="symplearn-")
-    os.environ.setdefault("MPLCONFIGDIR", fonts)
+    if "MPLCONFIGDIR" not in os.environ:
+        os.environ["MPLCONFIGDIR"] = str(folder / "matplotlib") if folder else _passing_folder()
+    jax.config.update("jax_enable_compilation_cache", cache)  # $JAX_COMPILATION_CACHE_DIR may name one, too
     if folder is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def _passing_folder() -> str:
+    """A folder that goes when the command ends."""
+    folder = tempfile.mkdtemp(prefix="symplearn-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def _private_folder() -> Path | None:
@@ -155,15 +171,28 @@ def _private_folder() -> Path | None:
 def main() -> None:
     """Run the command; wrong input is one line on stderr and exit code 2, a failure one line and exit code 1."""
     try:
-        app()
+        code = app(sys.argv[1:] or ["--help"], prog_name="symplearn", standalone_mode=False)
     except InputError as error:
-        print(f"symplearn: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("symplearn: stopped; nothing was written", file=sys.stderr)
-        sys.exit(130)
+        _leave(2, str(error))
+    except TyperException as error:
+        _leave(2, _usage_sentence(error))
+    except (KeyboardInterrupt, typer.Abort):
+        code = _STOPPED
     except Exception as error:
-        print(f"symplearn: failed: {type(error).__name__}: {error}", file=sys.stderr)
         if os.environ.get("SYMPLEARN_TRACEBACK"):
             raise
-        sys.exit(1)
+        _leave(1, f"failed: {type(error).__name__}: {printable(str(error))[:500]}")
+    if code == _STOPPED:
+        _leave(_STOPPED, "stopped; nothing was written")
+    sys.exit(code)
+
+
+def _leave(code: int, sentence: str) -> NoReturn:
+    print(f"symplearn: {sentence}", file=sys.stderr)
+    sys.exit(code)
+
+
+def _usage_sentence(error: Any) -> str:
+    """An error of the command line's own on one line."""
+    command = error.ctx.command_path if getattr(error, "ctx", None) else "symplearn"
+    return f"{printable(error.format_message().rstrip('.'))}; `{command} --help` tells what can be given"

@@ -43,7 +43,9 @@ def recorded(times, readings, inputs: Inputs | None = None, number: int = 1, col
     """A recording of given readings (time, channel)."""
     readings = np.asarray(readings, float).reshape(len(times), -1)
     columns = columns or tuple(f"y{j}" for j in range(readings.shape[1]))
-    return Recording(number, f"run{number}.csv", columns, np.asarray(times), readings, np.arange(len(times)) + 2, inputs)
+    return Recording(
+        number, f"run{number}.csv", columns, np.asarray(times), readings, np.arange(len(times)) + 2, inputs
+    )
 
 
 def problem(file: SimulationFile, recordings: Sequence[Recording], substep: float, holdout: float = 0.0) -> Problem:
@@ -54,4 +56,6 @@ def problem(file: SimulationFile, recordings: Sequence[Recording], substep: floa
 def solved(rates: Callable, start: Sequence[float], times: np.ndarray, tolerance: float = 1e-10) -> np.ndarray:
     """SciPy's DOP853 (time, state)."""
     span = (float(times[0]), float(times[-1]))
-    return solve_ivp(rates, span, start, "DOP853", times, rtol=tolerance, atol=tolerance * 1e-2).y.T
+    found = solve_ivp(rates, span, start, "DOP853", times, rtol=tolerance, atol=tolerance * 1e-2)
+    assert found.success, found.message
+    return found.y.T

@@ -13,6 +13,8 @@ from ._trajectory import Predictions, Stepper
 THINNED = 1.177
 # An estimated noise never falls below this share of the readings' spread: readings repeat themselves exactly.
 _FLOOR = 1e-9
+# Directions flatter than this share of the steepest are taken as flat.
+_FLAT = 1e-13
 # After this many steps a lane that lies this many nats behind the best is no longer improved.
 _PATIENCE, _HOPELESS = 6, 500.0
 
@@ -101,33 +103,37 @@ def calibrate(
     iterations: int = 40,
     tolerance: float = 1e-3,
 ) -> Fits:
-    """Levenberg-Marquardt over the first `rows` rows of every recording; `tolerance` in units of -2 log posterior."""
+    """Levenberg-Marquardt over the first `rows` rows of every recording.
+
+    A lane has converged when an undamped step promises less than `tolerance` of minus twice the log posterior.
+    """
     problem, lanes = stepper.problem, len(start)
     weight = weights(problem, rows)
     precision = np.stack([priors.precision_of(problem, c) for c in combinations])
     active = np.stack([problem.active(c) for c in combinations])
     fits = _evaluated(stepper, np.array(start, float), list(combinations), rows, weight)
-    damping, done, hopeless = np.full(lanes, 1e-3), np.zeros(lanes, bool), np.zeros(lanes, bool)
+    damping, done, stuck = np.full(lanes, 1e-3), np.zeros(lanes, bool), np.zeros(lanes, bool)
     fits = _costed(problem, fits, weight, precision, priors.mean)
     for count in range(iterations):
-        step = _steps(problem, fits, weight, precision, priors.mean, active, damping)
+        step, promised = _steps(problem, fits, weight, precision, priors.mean, active, damping)
+        done |= promised < tolerance
+        if done.all():
+            break
         trial_z = _bounded(problem, fits.z + np.where(done[:, None], 0.0, step))
         trial = _evaluated(stepper, trial_z, fits.combinations, rows, weight)
         trial = _costed(problem, replace(trial, noise=fits.noise), weight, precision, priors.mean)
         better = trial.cost <= fits.cost
-        gain = np.where(better, fits.cost - trial.cost, 0.0)
         merged = _merged(fits, trial, better)
         merged = replace(merged, noise=estimate_noise(problem, residuals(problem, merged.predictions, weight), weight))
         fits = _costed(problem, merged, weight, precision, priors.mean)
-        damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-9, 1e12)
-        done |= (better & (gain < tolerance)) | (damping > 1e8)
+        damping = np.clip(np.where(better, damping / 10, damping * 5), 1e-9, 1e12)
+        stuck |= damping > 1e8
+        done |= stuck
         if count >= _PATIENCE:
             value = fits.cost + 2 * _log_noise(problem, fits.noise, weight)
-            hopeless |= ~done & (value > np.nanmin(value) + 2 * _HOPELESS)
-            done |= hopeless
-        if done.all():
-            break
-    return replace(fits, converged=done & ~hopeless & np.isfinite(fits.cost))
+            stuck |= ~done & (value > np.nanmin(value) + 2 * _HOPELESS)
+            done |= stuck
+    return replace(fits, converged=done & ~stuck & np.isfinite(fits.cost))
 
 
 def _log_noise(problem: Problem, noise: np.ndarray, weight: list[np.ndarray]) -> np.ndarray:
@@ -168,20 +174,24 @@ def normal_equations(
     return matrix, vector
 
 
-def _steps(problem, fits: Fits, weight, precision, mean, active, damping) -> np.ndarray:
+def _steps(problem, fits: Fits, weight, precision, mean, active, damping) -> tuple[np.ndarray, np.ndarray]:
+    """Damped Gauss-Newton steps, and what an undamped one promises to take off the cost."""
     with np.errstate(over="ignore", invalid="ignore"):
         matrix, vector = normal_equations(problem, fits, weight)
     vector = vector - precision * (fits.z - mean)
-    steps = np.zeros_like(fits.z)
+    steps, promised = np.zeros_like(fits.z), np.full(len(fits.z), np.inf)
     for b in range(len(steps)):
         a = np.nonzero(active[b])[0]
         square = matrix[b][np.ix_(a, a)] + np.diag(precision[b][a])
         if not (np.isfinite(square).all() and np.isfinite(vector[b]).all()):
             continue
         scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
-        scaled = square / np.outer(scale, scale) + damping[b] * np.eye(len(a))
-        steps[b, a] = np.linalg.lstsq(scaled, vector[b, a] / scale, rcond=1e-14)[0] / scale
-    return steps
+        values, vectors = np.linalg.eigh(square / np.outer(scale, scale))
+        values = np.maximum(values, _FLAT * values[-1])
+        along = vectors.T @ (vector[b, a] / scale)
+        steps[b, a] = vectors @ (along / (values + damping[b])) / scale
+        promised[b] = float((along**2 / values).sum())
+    return steps, promised
 
 
 def _bounded(problem: Problem, z: np.ndarray) -> np.ndarray:

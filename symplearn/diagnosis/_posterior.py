@@ -12,6 +12,8 @@ from ._weighed import Estimate
 
 # A coefficient whose posterior is as wide as this share of its prior has learnt nothing from the recording.
 _UNINFORMED = 0.7
+# Nats that an estimate which did not converge must be ahead to be reported nevertheless.
+_UNCONVERGED = 3.0
 # Kinds of remainder other than white noise; each combination divides its remainder's prior among them.
 _REMAINDERS = ("coloured", "force")
 
@@ -63,7 +65,7 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
             white, other = plain, noisy
         elif _informed(problem, found, combination):
             weight = float(np.log([price[c] for c in combination]).sum())
-            named.append((combination, weight, total, max(estimates, key=lambda e: e.log_evidence)))
+            named.append((combination, weight, total, _speaker(estimates)))
     logs = np.array([white, np.log(remainder) + other, *(w + total for _, w, total, _ in named)])
     probability = np.exp(logs - logs.max())
     probability /= probability.sum()
@@ -72,10 +74,15 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
         as_it_is=float(probability[0]),
         unexplained=float(probability[1]),
         named=tuple(Weighed(c, float(p), float(total), best) for (c, _, total, best), p in ranked),
-        nothing=max(found.estimates[()], key=lambda e: e.log_evidence),
+        nothing=_speaker(found.estimates[()]),
         evidences=evidences,
         tempered=factor,
     )
+
+
+def _speaker(estimates: Sequence[Estimate]) -> Estimate:
+    """The estimate of the best kind of remainder; one that converged is preferred to one barely ahead that did not."""
+    return max(estimates, key=lambda e: e.log_evidence - (0.0 if e.converged else _UNCONVERGED))
 
 
 def _mixture(values: Sequence[float]) -> float:

@@ -13,7 +13,7 @@ from ._trajectory import Stepper
 
 # Starts tried for the initial states, and the spread of the random ones.
 _STARTS = 16
-_SPREADS = (0.1, 1.0, 1.0, 10.0)
+_SPREADS = (1e-3, 0.1, 1.0, 10.0)
 # Prior scale of an effect: its force against the forces already there, or its error against the reading's spread.
 STRENGTH = 0.3
 

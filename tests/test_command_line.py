@@ -1,0 +1,209 @@
+"""`symplearn diagnose` keeps the contract: its files, its exit codes, its streams and its options."""
+
+import csv
+import gzip
+import json
+import os
+import stat
+
+import numpy as np
+import pytest
+from command_line_cases import DEMO, ONE_EFFECT, SIMULATION, csv_text, damped, run_apart, run_here, write_case
+from contract import check_document, strict_json
+
+from symplearn._simulation_file import read_simulation
+
+
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory):
+    """One run of the case that ships with the package, in a process and a home of its own: (run, folder, home)."""
+    home = tmp_path_factory.mktemp("home")
+    work = home / "work"
+    work.mkdir()
+    files = DEMO / "simulation.toml", DEMO / "recording.csv"
+    # The shared cache of compiled programs stays in use: the run is then seconds, not minutes.
+    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    ran = run_apart(
+        "diagnose", *files, "--out", "out", "--forecast-until", "22", "--forecast-step", "0.5", "--fail-on-mismatch",
+        cwd=work, HOME=str(home), XDG_CACHE_HOME=cache, PYTHONDONTWRITEBYTECODE="1",
+    )  # fmt: skip
+    return ran, work / "out", home
+
+
+@pytest.fixture
+def command(capsys, monkeypatch):
+    """The command in this process."""
+    return lambda *arguments: run_here(capsys, monkeypatch, *arguments)
+
+
+def read(folder):
+    """The diagnosis in a folder."""
+    return strict_json((folder / "diagnosis.json").read_text(encoding="utf-8"))
+
+
+def without_seconds(folder):
+    """The diagnosis as text, but for the one key that may differ."""
+    return json.dumps(read(folder) | {"seconds": 0})
+
+
+@pytest.mark.slow
+def test_demo_names_the_concealed_effect(demo):
+    """The case inside the package: viscous damping found with certainty, its value right, its rivals rejected."""
+    ran, out, _ = demo
+    document = read(out)
+    check_document(document, ["angle_rad"], ["p_theta"], recordings=3)
+    assert document["verdict"] == "mismatch"
+    assert [(f["effect"], f["target"]) for f in document["findings"]] == [("viscous_damping", "theta")]
+    assert document["probability"] > 0.75  # 0.89 when the case was made
+    low, high = document["findings"][0]["coefficients"]["c"]["interval95"]
+    assert low < 0.0015 < high  # experiments/demo_case.py
+    before, after = (document["fit"][w]["holdout_rmse"]["angle_rad"] for w in ("before", "after"))
+    assert after < 0.08 * 1.1 and before > 2 * after  # the noise is 0.08: nothing but it is left
+
+
+@pytest.mark.slow
+def test_demo_streams_and_exit_code(demo):
+    """The finding stands on stdout, the progress on stderr, and --fail-on-mismatch exits with 3."""
+    ran, out, _ = demo
+    assert ran.code == 3
+    assert "viscous damping" in ran.out and "report.html" in ran.out and "weighing" not in ran.out
+    assert "weighing" in ran.err and "viscous" not in ran.err
+    assert "Traceback" not in ran.err and "Warning" not in ran.err
+
+
+@pytest.mark.slow
+def test_demo_writes_its_files_and_nothing_else(demo):
+    """Four files under their names, nothing beside them, and nothing anywhere else in the home."""
+    _, out, home = demo
+    names = {"diagnosis.json", "report.html", "augmented.toml", "forecast.csv"}
+    assert {path.name for path in out.iterdir()} == names
+    assert {path for path in home.rglob("*") if path.is_file()} == {out / name for name in names}
+    assert read_simulation(out / "augmented.toml").terms
+
+
+@pytest.mark.slow
+def test_forecast_has_the_rows_and_columns_of_the_contract(demo):
+    """Rows run from the last observed time + DT to T; the expected readings are finite, their sd positive."""
+    _, out, _ = demo
+    with open(out / "forecast.csv", newline="") as file:
+        header, *rows = csv.reader(file)
+    kinds = ("before", "before_sd", "after", "after_sd")
+    assert header == ["t", *(f"angle_rad_{kind}" for kind in kinds)]
+    values = np.array(rows, float)
+    assert np.allclose(values[:, 0], [20.5, 21.0, 21.5, 22.0])
+    assert np.isfinite(values).all() and (values[:, [2, 4]] > 0).all()
+
+
+def test_small_case_keeps_the_contract(command, tmp_path):
+    """A one-effect search gives every key of section 4, exit code 0, and the closed form's damping."""
+    ran = command("diagnose", *write_case(tmp_path), "--out", tmp_path / "out", *ONE_EFFECT)
+    document = read(tmp_path / "out")
+    assert ran.code == 0
+    check_document(document, ["x_m"], ["p"])
+    low, high = document["findings"][0]["coefficients"]["c"]["interval95"]
+    assert low < 0.1 < high
+    assert not (tmp_path / "out" / "forecast.csv").exists()
+
+
+def test_same_files_give_the_same_answer(command, tmp_path):
+    """Same seed, same files: the same diagnosis but for `seconds`, whatever --jobs is."""
+    case = write_case(tmp_path)
+    for name, options in {"a": (), "b": ("--jobs", "1"), "c": ("--jobs", "2")}.items():
+        command("diagnose", *case, "--out", tmp_path / name, *ONE_EFFECT, *options)
+    assert without_seconds(tmp_path / "a") == without_seconds(tmp_path / "b") == without_seconds(tmp_path / "c")
+    augmented = {(tmp_path / name / "augmented.toml").read_text() for name in "abc"}
+    assert len(augmented) == 1
+
+
+def test_nothing_held_out_is_null(command, tmp_path):
+    """--holdout 0 fits every row: the held-out keys are null, all others as ever."""
+    ran = command("diagnose", *write_case(tmp_path), "--out", tmp_path / "out", *ONE_EFFECT, "--holdout", "0")
+    assert ran.code == 0
+    check_document(read(tmp_path / "out"), ["x_m"], ["p"], held_out=False)
+
+
+def test_effects_can_be_restricted(command, tmp_path):
+    """--effects, --sensor-only and --dynamics-only keep every other effect out of findings and alternatives."""
+    case = write_case(tmp_path)
+    sensor = {"sensor_bias", "sensor_gain"}
+    allowed = {"--sensor-only": sensor, "--effects=viscous_damping, sensor_bias": {"viscous_damping", "sensor_bias"}}
+    for option, names in allowed.items():
+        assert command("diagnose", *case, "--out", tmp_path / "out", option).code == 0
+        document = read(tmp_path / "out")
+        check_document(document, ["x_m"], ["p"])
+        rows = [{"findings": document["findings"]}, *document["alternatives"]]
+        assert {one["effect"] for row in rows for one in row["findings"]} <= names
+    option = ("--dynamics-only", "--effects", "viscous_damping,sensor_bias")
+    command("diagnose", *case, "--out", tmp_path / "out", *option)
+    rows = read(tmp_path / "out")["alternatives"]
+    assert not {one["effect"] for row in rows for one in row["findings"]} & sensor
+
+
+def test_compressed_files_read_the_same(command, tmp_path):
+    """A .csv.gz gives the answer of its .csv."""
+    case = write_case(tmp_path)
+    packed = tmp_path / "recording.csv.gz"
+    packed.write_bytes(gzip.compress((tmp_path / "recording.csv").read_bytes()))
+    command("diagnose", *case, "--out", tmp_path / "a", *ONE_EFFECT)
+    command("diagnose", case[0], packed, "--out", tmp_path / "b", *ONE_EFFECT)
+    assert without_seconds(tmp_path / "a") == without_seconds(tmp_path / "b")
+
+
+def test_several_files_and_groups_are_several_recordings(command, tmp_path):
+    """Two files, or two groups in one, are the same two recordings: numbered, with their own windows and start."""
+    first, second = damped(seed=1), damped(start=0.5, seed=2)
+    (tmp_path / "simulation.toml").write_text(SIMULATION)
+    (tmp_path / "grouped.toml").write_text(SIMULATION.replace('time = "t"', 'time = "t"\ngroup = "run"'))
+    (tmp_path / "1.csv").write_text(csv_text(*first))
+    (tmp_path / "2.csv").write_text(csv_text(*second))
+    rows = [f"{t!r},{run},{x!r}" for run, pair in (("b", first), ("a", second)) for t, x in zip(*pair, strict=True)]
+    (tmp_path / "both.csv").write_text(
+        "\n".join(["t,run,x_m", *(row.replace("np.float64(", "").replace(")", "") for row in rows)])
+    )
+    files, grouped = tmp_path / "files", tmp_path / "groups"
+    command(
+        "diagnose", tmp_path / "simulation.toml", tmp_path / "1.csv", tmp_path / "2.csv", "--out", files, *ONE_EFFECT
+    )
+    command("diagnose", tmp_path / "grouped.toml", tmp_path / "both.csv", "--out", grouped, *ONE_EFFECT)
+    document = read(files)
+    check_document(document, ["x_m"], ["p"], recordings=2)
+    assert [window[2] for window in document["location"]["time_windows"]] == [1, 2]
+    assert without_seconds(files) == without_seconds(grouped)
+
+
+def test_nothing_left_out_is_consistent(command, tmp_path):
+    """A recording that the simulation explains is `consistent`, also to --fail-on-mismatch."""
+    case = write_case(tmp_path, damping=0.0)
+    ran = command("diagnose", *case, "--out", tmp_path / "out", *ONE_EFFECT, "--fail-on-mismatch")
+    document = read(tmp_path / "out")
+    check_document(document, ["x_m"], ["p"])
+    assert ran.code == 0 and document["verdict"] == "consistent"
+
+
+def test_augmented_simulation_is_not_accused_again(command, tmp_path):
+    """Diagnosing the same recording with augmented.toml never names the same effect and target again."""
+    simulation, recording = write_case(tmp_path)
+    options = ("--effects", "viscous_damping,linear_stiffness")
+    command("diagnose", simulation, recording, "--out", tmp_path / "first", *options)
+    first = read(tmp_path / "first")
+    command("diagnose", tmp_path / "first" / "augmented.toml", recording, "--out", tmp_path / "second", *options)
+    second = read(tmp_path / "second")
+    check_document(second, ["x_m"], ["p"])
+    assert [f["effect"] for f in first["findings"]] == ["viscous_damping"]
+    assert second["verdict"] in ("consistent", "unexplained") and not second["findings"]
+
+
+def test_cache_is_private_and_can_be_switched_off(tmp_path):
+    """Compiled programs lie in a folder of mode 0700; --no-cache leaves no file, here or among temporary files."""
+    case = write_case(tmp_path)
+    home, scratch = tmp_path / "home", tmp_path / "scratch"
+    home.mkdir()
+    scratch.mkdir()
+    places = dict(HOME=str(home), XDG_CACHE_HOME=str(home / "cache"), TMPDIR=str(scratch), PYTHONDONTWRITEBYTECODE="1")
+    # An unknown effect is refused after the cache was prepared, and long before anything is compiled.
+    for _ in range(2):
+        run_apart("diagnose", *case, "--out", tmp_path / "out", "--effects", "none", "--no-cache", **places)
+        assert not list(home.iterdir()) and not list(scratch.iterdir())
+    run_apart("diagnose", *case, "--out", tmp_path / "out", "--effects", "none", **places)
+    folders = [path for path in (home / "cache").rglob("*") if path.is_dir()]
+    assert folders and {stat.S_IMODE(path.stat().st_mode) for path in folders} == {0o700}
