@@ -190,7 +190,7 @@ class _Reader:
             except ValueError:
                 pass  # such as `1e` or `--`: found below
         values = np.array(
-            [self.number(cell, column, line) for cell, line in zip(cells, lines, strict=True)], dtype=float
+            [self.number(cell, column, int(line)) for cell, line in zip(cells, lines, strict=True)], dtype=float
         )
         return self.finite(values, cells, column, lines)
 
@@ -209,7 +209,7 @@ class _Reader:
         infinite = np.isinf(values)
         if infinite.any():
             first = int(np.argmax(infinite))
-            raise self.refusal(cells[first], column, lines[first])
+            raise self.refusal(cells[first], column, int(lines[first]))
         return values
 
     def refusal(self, cell: str, column: str, line: int) -> InputError:

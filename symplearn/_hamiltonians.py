@@ -17,7 +17,7 @@ class AbstractBasis(eqx.Module):
     """Polynomials B_0 = 1, B_1, ... of one variable, from which products over the variables are made."""
 
     @abc.abstractmethod
-    def values(self, z: Float[Array, " variable"], degree: int) -> Float[Array, "degree+1 variable"]:
+    def values(self, z: Float[Array, " variable"], degree: int) -> Float[Array, "power variable"]:
         """B_n(z_i) for n = 0..degree."""
 
     @abc.abstractmethod
@@ -37,7 +37,7 @@ class AbstractBasis(eqx.Module):
 class Monomials(AbstractBasis):
     """1, z, z^2, ..."""
 
-    def values(self, z: Float[Array, " variable"], degree: int) -> Float[Array, "degree+1 variable"]:
+    def values(self, z: Float[Array, " variable"], degree: int) -> Float[Array, "power variable"]:
         return jnp.cumprod(jnp.concatenate([jnp.ones((1, z.shape[0])), jnp.tile(z, (degree, 1))]), axis=0)
 
     def slopes(self, degree: int) -> np.ndarray:
@@ -64,7 +64,7 @@ class Legendre(AbstractBasis):
     def scales(self, variables: int) -> Float[Array, " variable"]:
         return jnp.broadcast_to(jnp.asarray(self.box, dtype=float), (variables,))
 
-    def values(self, z: Float[Array, " variable"], degree: int) -> Float[Array, "degree+1 variable"]:
+    def values(self, z: Float[Array, " variable"], degree: int) -> Float[Array, "power variable"]:
         x = z / self.scales(z.shape[0])
         table = [jnp.ones_like(x), x]
         for n in range(1, degree):
@@ -127,7 +127,7 @@ def _gradient(basis: AbstractBasis, coefficients: Array, z: Array, degree: int) 
 
 def _terms(basis: AbstractBasis, names: list[str], degree: int) -> tuple[str, ...]:
     def written(row):
-        return " ".join(basis.written(name, power) for name, power in zip(names, row, strict=True) if power)
+        return " ".join(basis.written(name, int(power)) for name, power in zip(names, row, strict=True) if power)
 
     return tuple(written(row) for row in exponents(len(names), degree))
 

@@ -1,7 +1,7 @@
 """What makes recordings unusable, each told in one sentence."""
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from ._errors import InputError, shown
 from ._simulation_records import SimulationFile
 
 
+@runtime_checkable
 class _Rows(Protocol):
     """What is looked at of a recording."""
 

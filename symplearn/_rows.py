@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +16,7 @@ from ._thinning import Thinned, thin, thinning_width
 _WIDE = 1.5
 
 
+@runtime_checkable
 class HasRows(Protocol):
     """What is asked of a recording: times (n,), readings (n, m) with NaN for missing, inputs or None."""
 

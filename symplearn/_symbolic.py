@@ -187,7 +187,7 @@ class _Walk:
             return xp.full(self.shape, bool(expr))
         raise ValueError(f"no array operation is known for {function} in {expr}")
 
-    def piecewise(self, expr: sympy.Piecewise) -> Any:
+    def piecewise(self, expr: sympy.Expr) -> Any:
         result = self.constant(math.nan)
         for value, condition in reversed(expr.args):
             result = self.xp.where(self(condition), self(value), result)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 # A recording is left alone below this many rows: there is nothing to gain.
 _ENOUGH = 2000
 # Rows kept per shortest period of the motion. With the curvature correction below, averaging over 1/20 of a period
-# changes its amplitude by (2 pi / 20)^4 / 1920 = 5e-6.
+# changes its amplitude by 9 (2 pi / 20)^4 / 1920 = 5e-5.
 _PER_PERIOD = 20
 # Share of the readings' variance that may lie above the highest frequency counted as motion.
 _SHARE = 1e-4
@@ -26,7 +26,7 @@ class Thinned:
 def highest_frequency(times: Float[np.ndarray, " time"], readings: Float[np.ndarray, "time channel"]) -> float:
     """The frequency below which the motion lies, in 1/time; 0 where nothing stands above the noise.
 
-    Read from the periodogram (Hann window) on an even grid: lines twelve times above the floor of the upper half.
+    Read from the periodogram (Hann window) on an even grid: lines that stand out of the noise of the upper half.
     """
     highest = 0.0
     grid = np.linspace(times[0], times[-1], min(len(times), 1 << 17))
@@ -36,7 +36,9 @@ def highest_frequency(times: Float[np.ndarray, " time"], readings: Float[np.ndar
             continue
         even = np.interp(grid, times[seen], column[seen])
         power = np.abs(np.fft.rfft((even - even.mean()) * np.hanning(len(grid)))) ** 2
-        power[power < 12 * np.median(power[len(power) // 2 :])] = 0.0
+        # The largest of so many exponential bins of pure noise stays below this, but for once in e^5 times.
+        highest_noise = (np.log(len(power)) + 5) / np.log(2) * np.median(power[len(power) // 2 :])
+        power[power < highest_noise] = 0.0
         above = np.cumsum(power[::-1])[::-1]
         lines = np.nonzero(above > _SHARE * above[0])[0] if above[0] > 0 else np.zeros(1, int)
         highest = max(highest, float(lines[-1]) / (grid[-1] - grid[0]))

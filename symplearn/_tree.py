@@ -100,7 +100,7 @@ def settled(expr: sympy.Expr) -> sympy.Expr:
     return expr.xreplace(long) if long else expr
 
 
-def _balanced(function: type[sympy.Function], arguments: Sequence[sympy.Expr]) -> sympy.Expr:
+def _balanced(function: Callable[..., sympy.Expr], arguments: Sequence[sympy.Expr]) -> sympy.Expr:
     """max and min of many as a balanced tree of pairs: its depth is the logarithm of their number."""
     if len(arguments) == 1:
         return arguments[0]
@@ -109,7 +109,7 @@ def _balanced(function: type[sympy.Function], arguments: Sequence[sympy.Expr]) -
 
 
 # word: (SymPy function, its value for plain numbers, number of arguments; None for two or more)
-FUNCTIONS: dict[str, tuple[type[sympy.Function], Callable[..., float], int | None]] = {
+FUNCTIONS: dict[str, tuple[Callable[..., sympy.Expr], Callable[..., float], int | None]] = {
     "sin": (sympy.sin, math.sin, 1),
     "cos": (sympy.cos, math.cos, 1),
     "tan": (sympy.tan, math.tan, 1),

@@ -61,13 +61,13 @@ def stepper():
 
 @pytest.fixture(scope="module")
 def fits(stepper):
-    """Calibrated without effects, and with dry friction beside the damping."""
+    """Calibrated without effects, and with a quadratic drag beside the damping."""
     p = stepper.problem
     priors = with_scale(p)
     start = np.tile(priors.mean, (2, 1))
     # Away from the truth by much more than the noise, and momenta, which are not read alone, by their size.
     start[:, :4] = [0.9, 0.0, -0.9, 0.0]
-    combinations = [(), (place(p, "coulomb_friction"),)]
+    combinations = [(), (place(p, "quadratic_drag"),)]
     return calibrate(stepper, start, combinations, priors, rows(p), tolerance=1e-9)
 
 

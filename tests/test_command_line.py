@@ -30,6 +30,14 @@ def demo(tmp_path_factory):
     return ran, work / "out", home
 
 
+@pytest.fixture(scope="session")
+def small(tmp_path_factory):
+    """One run on the small case, in a process of its own: (run, its files, folder)."""
+    folder = tmp_path_factory.mktemp("small")
+    case = write_case(folder)
+    return run_apart("diagnose", *case, "--out", folder / "out", *ONE_EFFECT), case, folder / "out"
+
+
 @pytest.fixture
 def command(capsys, monkeypatch):
     """The command in this process."""
@@ -46,7 +54,6 @@ def without_seconds(folder):
     return json.dumps(read(folder) | {"seconds": 0})
 
 
-@pytest.mark.slow
 def test_demo_names_the_concealed_effect(demo):
     """The case inside the package: viscous damping found with certainty, its value right, its rivals rejected."""
     ran, out, _ = demo
@@ -61,7 +68,6 @@ def test_demo_names_the_concealed_effect(demo):
     assert after < 0.08 * 1.1 and before > 2 * after  # the noise is 0.08: nothing but it is left
 
 
-@pytest.mark.slow
 def test_demo_streams_and_exit_code(demo):
     """The finding stands on stdout, the progress on stderr, and --fail-on-mismatch exits with 3."""
     ran, out, _ = demo
@@ -71,7 +77,6 @@ def test_demo_streams_and_exit_code(demo):
     assert "Traceback" not in ran.err and "Warning" not in ran.err
 
 
-@pytest.mark.slow
 def test_demo_writes_its_files_and_nothing_else(demo):
     """Four files under their names, nothing beside them, and nothing anywhere else in the home."""
     _, out, home = demo
@@ -81,7 +86,6 @@ def test_demo_writes_its_files_and_nothing_else(demo):
     assert read_simulation(out / "augmented.toml").terms
 
 
-@pytest.mark.slow
 def test_forecast_has_the_rows_and_columns_of_the_contract(demo):
     """Rows run from the last observed time + DT to T; the expected readings are finite, their sd positive."""
     _, out, _ = demo
@@ -94,25 +98,30 @@ def test_forecast_has_the_rows_and_columns_of_the_contract(demo):
     assert np.isfinite(values).all() and (values[:, [2, 4]] > 0).all()
 
 
-def test_small_case_keeps_the_contract(command, tmp_path):
-    """A one-effect search gives every key of section 4, exit code 0, and the closed form's damping."""
-    ran = command("diagnose", *write_case(tmp_path), "--out", tmp_path / "out", *ONE_EFFECT)
-    document = read(tmp_path / "out")
+def mentioned(document):
+    """Every effect in findings and alternatives."""
+    rows = [document, *document["alternatives"]]
+    return {one["effect"] for row in rows for one in row["findings"]}
+
+
+def test_small_case_keeps_the_contract(small):
+    """A one-effect search gives every key of section 4, exit code 0, no other effect, and the closed form's damping."""
+    ran, _, out = small
+    document = read(out)
     assert ran.code == 0
     check_document(document, ["x_m"], ["p"])
     low, high = document["findings"][0]["coefficients"]["c"]["interval95"]
     assert low < 0.1 < high
-    assert not (tmp_path / "out" / "forecast.csv").exists()
+    assert mentioned(document) == {"viscous_damping"}
+    assert not (out / "forecast.csv").exists()
 
 
-def test_same_files_give_the_same_answer(command, tmp_path):
-    """Same seed, same files: the same diagnosis but for `seconds`, whatever --jobs is."""
-    case = write_case(tmp_path)
-    for name, options in {"a": (), "b": ("--jobs", "1"), "c": ("--jobs", "2")}.items():
-        command("diagnose", *case, "--out", tmp_path / name, *ONE_EFFECT, *options)
-    assert without_seconds(tmp_path / "a") == without_seconds(tmp_path / "b") == without_seconds(tmp_path / "c")
-    augmented = {(tmp_path / name / "augmented.toml").read_text() for name in "abc"}
-    assert len(augmented) == 1
+def test_same_files_give_the_same_answer(small, command, tmp_path):
+    """Same seed, same files: the same answer but for `seconds`, in another process and with other --jobs."""
+    _, case, out = small
+    command("diagnose", *case, "--out", tmp_path, *ONE_EFFECT, "--jobs", "1")
+    assert without_seconds(tmp_path) == without_seconds(out)
+    assert (tmp_path / "augmented.toml").read_text() == (out / "augmented.toml").read_text()
 
 
 def test_nothing_held_out_is_null(command, tmp_path):
@@ -122,31 +131,26 @@ def test_nothing_held_out_is_null(command, tmp_path):
     check_document(read(tmp_path / "out"), ["x_m"], ["p"], held_out=False)
 
 
-def test_effects_can_be_restricted(command, tmp_path):
-    """--effects, --sensor-only and --dynamics-only keep every other effect out of findings and alternatives."""
-    case = write_case(tmp_path)
-    sensor = {"sensor_bias", "sensor_gain"}
-    allowed = {"--sensor-only": sensor, "--effects=viscous_damping, sensor_bias": {"viscous_damping", "sensor_bias"}}
-    for option, names in allowed.items():
-        assert command("diagnose", *case, "--out", tmp_path / "out", option).code == 0
-        document = read(tmp_path / "out")
-        check_document(document, ["x_m"], ["p"])
-        rows = [{"findings": document["findings"]}, *document["alternatives"]]
-        assert {one["effect"] for row in rows for one in row["findings"]} <= names
-    option = ("--dynamics-only", "--effects", "viscous_damping,sensor_bias")
-    command("diagnose", *case, "--out", tmp_path / "out", *option)
-    rows = read(tmp_path / "out")["alternatives"]
-    assert not {one["effect"] for row in rows for one in row["findings"]} & sensor
+def test_effects_can_be_restricted(small, command, tmp_path):
+    """--sensor-only and --dynamics-only keep every other effect out of findings and alternatives."""
+    _, case, _ = small
+    assert command("diagnose", *case, "--out", tmp_path, "--sensor-only").code == 0
+    document = read(tmp_path)
+    check_document(document, ["x_m"], ["p"])
+    assert mentioned(document) <= {"sensor_bias", "sensor_gain"}
+    options = ("--dynamics-only", "--effects", "viscous_damping, sensor_bias")
+    assert command("diagnose", *case, "--out", tmp_path, *options).code == 0
+    assert mentioned(read(tmp_path)) == {"viscous_damping"}
 
 
-def test_compressed_files_read_the_same(command, tmp_path):
+def test_compressed_files_read_the_same(small, command, tmp_path):
     """A .csv.gz gives the answer of its .csv."""
-    case = write_case(tmp_path)
+    _, (simulation, recording), out = small
     packed = tmp_path / "recording.csv.gz"
-    packed.write_bytes(gzip.compress((tmp_path / "recording.csv").read_bytes()))
-    command("diagnose", *case, "--out", tmp_path / "a", *ONE_EFFECT)
-    command("diagnose", case[0], packed, "--out", tmp_path / "b", *ONE_EFFECT)
-    assert without_seconds(tmp_path / "a") == without_seconds(tmp_path / "b")
+    with open(recording, "rb") as file:
+        packed.write_bytes(gzip.compress(file.read()))
+    command("diagnose", simulation, packed, "--out", tmp_path, *ONE_EFFECT)
+    assert without_seconds(tmp_path) == without_seconds(out)
 
 
 def test_several_files_and_groups_are_several_recordings(command, tmp_path):
@@ -156,10 +160,12 @@ def test_several_files_and_groups_are_several_recordings(command, tmp_path):
     (tmp_path / "grouped.toml").write_text(SIMULATION.replace('time = "t"', 'time = "t"\ngroup = "run"'))
     (tmp_path / "1.csv").write_text(csv_text(*first))
     (tmp_path / "2.csv").write_text(csv_text(*second))
-    rows = [f"{t!r},{run},{x!r}" for run, pair in (("b", first), ("a", second)) for t, x in zip(*pair, strict=True)]
-    (tmp_path / "both.csv").write_text(
-        "\n".join(["t,run,x_m", *(row.replace("np.float64(", "").replace(")", "") for row in rows)])
-    )
+    rows = [
+        f"{t!r},{run},{x!r}"
+        for run, pair in (("b", first), ("a", second))
+        for t, x in zip(*(a.tolist() for a in pair), strict=True)
+    ]
+    (tmp_path / "both.csv").write_text("t,run,x_m\n" + "\n".join(rows))
     files, grouped = tmp_path / "files", tmp_path / "groups"
     command(
         "diagnose", tmp_path / "simulation.toml", tmp_path / "1.csv", tmp_path / "2.csv", "--out", files, *ONE_EFFECT
@@ -180,17 +186,15 @@ def test_nothing_left_out_is_consistent(command, tmp_path):
     assert ran.code == 0 and document["verdict"] == "consistent"
 
 
-def test_augmented_simulation_is_not_accused_again(command, tmp_path):
+def test_augmented_simulation_is_not_accused_again(small, command, tmp_path):
     """Diagnosing the same recording with augmented.toml never names the same effect and target again."""
-    simulation, recording = write_case(tmp_path)
+    _, (_, recording), out = small
+    assert {finding["effect"] for finding in read(out)["findings"]} == {"viscous_damping"}
     options = ("--effects", "viscous_damping,linear_stiffness")
-    command("diagnose", simulation, recording, "--out", tmp_path / "first", *options)
-    first = read(tmp_path / "first")
-    command("diagnose", tmp_path / "first" / "augmented.toml", recording, "--out", tmp_path / "second", *options)
-    second = read(tmp_path / "second")
-    check_document(second, ["x_m"], ["p"])
-    assert [f["effect"] for f in first["findings"]] == ["viscous_damping"]
-    assert second["verdict"] in ("consistent", "unexplained") and not second["findings"]
+    assert command("diagnose", out / "augmented.toml", recording, "--out", tmp_path, *options).code == 0
+    document = read(tmp_path)
+    check_document(document, ["x_m"], ["p"])
+    assert document["verdict"] in ("consistent", "unexplained") and not document["findings"]
 
 
 def test_cache_is_private_and_can_be_switched_off(tmp_path):
@@ -201,9 +205,8 @@ def test_cache_is_private_and_can_be_switched_off(tmp_path):
     scratch.mkdir()
     places = dict(HOME=str(home), XDG_CACHE_HOME=str(home / "cache"), TMPDIR=str(scratch), PYTHONDONTWRITEBYTECODE="1")
     # An unknown effect is refused after the cache was prepared, and long before anything is compiled.
-    for _ in range(2):
-        run_apart("diagnose", *case, "--out", tmp_path / "out", "--effects", "none", "--no-cache", **places)
-        assert not list(home.iterdir()) and not list(scratch.iterdir())
+    run_apart("diagnose", *case, "--out", tmp_path / "out", "--effects", "none", "--no-cache", **places)
+    assert not list(home.iterdir()) and not list(scratch.iterdir())
     run_apart("diagnose", *case, "--out", tmp_path / "out", "--effects", "none", **places)
     folders = [path for path in (home / "cache").rglob("*") if path.is_dir()]
     assert folders and {stat.S_IMODE(path.stat().st_mode) for path in folders} == {0o700}

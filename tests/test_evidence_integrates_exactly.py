@@ -120,6 +120,15 @@ def test_two_half_priors_are_integrated_over_their_quadrant(truth):
     np.testing.assert_allclose(found.log_evidence, math.log(integral / 0.25), atol=1e-2)
 
 
+@pytest.mark.parametrize("truth", [(-0.4, -0.5), (-1.0, -1.0), (-1.4, -1.5), (-3.0, -2.0)])
+def test_two_forbidden_signs_cost_twice(truth):
+    """Two unknowns that know nothing of each other: their evidence is the sum of two, however forbidden both are."""
+    both = Line(np.eye(2), truth, 0.2, [0.0, 0.0], [1.0, 1.0], [0.0, 0.0]).laplace(lower={0: 0.0, 1: 0.0})
+    alone = [Line([[1.0]], [y], 0.2, [0.0], [1.0], [0.0]).laplace(lower={0: 0.0}) for y in truth]
+    # A tenth of a nat moves no probability by more than a tenth of itself.
+    assert both.log_evidence == pytest.approx(sum(one.log_evidence for one in alone), abs=0.1)
+
+
 def test_the_inflation_of_white_scores_is_one():
     """Scores of whitened rows have the variance that whitened rows would have."""
     scores = np.random.default_rng(0).normal(size=(2400, 200)) * np.geomspace(1e-3, 1e3, 200)

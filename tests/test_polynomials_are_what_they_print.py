@@ -56,7 +56,7 @@ def test_the_printed_equation_is_the_energy(name):
             base, _, power = word.partition("^")
             coefficient *= numbers[base] ** int(power or 1)
     # Coefficients are printed with six digits, and there are up to 34 terms.
-    assert total == pytest.approx(float(H.energy(q, p)), abs=1e-4)
+    assert total == pytest.approx(float(H.energy(jnp.asarray(q), jnp.asarray(p))), abs=1e-4)
 
 
 def test_legendre_products_are_scipys():

@@ -45,7 +45,7 @@ def model(initial=None, system=None, integrator=None):
 )
 def test_densities_are_scipys(density, oracle):
     """Normal and half-normal take variances, Laplace a scale; each is SciPy's density."""
-    x = np.array([0.0, 0.2, 1.7, 5.0])
+    x = jnp.array([0.0, 0.2, 1.7, 5.0])
     np.testing.assert_allclose(density.log_density(x), oracle.logpdf(x), rtol=1e-13)
 
 

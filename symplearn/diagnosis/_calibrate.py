@@ -68,7 +68,8 @@ def residuals(problem: Problem, predictions: list[Predictions], weight: list[np.
 
 def estimate_noise(problem: Problem, r: list[np.ndarray], weight: list[np.ndarray]) -> np.ndarray:
     """Noise sd of one reading by lane and channel: known where the file knows it, else the residuals' rms."""
-    square = sum((w * x**2).sum(1) for w, x in zip(weight, r, strict=True))
+    with np.errstate(over="ignore", invalid="ignore"):  # a lane that diverged is told by its cost
+        square = sum((w * x**2).sum(1) for w, x in zip(weight, r, strict=True))
     number = sum((w > 0).sum(0) for w in weight)
     spread = np.concatenate([np.where(w > 0, rows.readings[: len(w)], np.nan)
                              for w, rows in zip(weight, problem.rows, strict=True)])  # fmt: skip

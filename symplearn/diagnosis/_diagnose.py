@@ -265,7 +265,8 @@ class _Answer:
 
     def _unexplained_location(self) -> dict[str, Any]:
         eq, several = self.problem.equations, len(self.lens) > 1
-        if self.before.kind == "coloured":
+        # A nearly periodic remainder goes with the motion, so a force is likelier than an error of the sensor.
+        if self.before.kind == "coloured" and all(colour.damping >= 1 for colour in self.before.colours):
             kind, targets = "sensor", list(eq.columns)
             where = "the readings are off in a way that remembers itself, without a name in the vocabulary"
             windows = document.whole_windows(self.lens)

@@ -10,6 +10,8 @@ from scipy.stats import multivariate_normal, norm
 _TINY = 1e-300
 # Standard deviations that a variance of block sums may lie above its expectation and still be chance.
 _CHANCE = 2.5
+# Standard deviations beyond a bound from which a cubature of the allowed region is no longer to be trusted.
+_FAR = -4.0
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,9 @@ def laplace(
     values, vectors = np.linalg.eigh(scaled)
     values = np.maximum(values, 1e-13)  # a direction that neither data nor prior hold keeps a wide, finite spread
     inverse = (vectors / values) @ vectors.T / np.outer(scale, scale)
-    step = inverse @ vector
-    square = gram[0, 0] + (precision[a] * (z - mean)[a] ** 2).sum() - vector @ step
+    along = vectors.T @ (vector / scale)  # not through the inverse, which loses what flat directions leave
+    step = vectors @ (along / values) / scale
+    square = gram[0, 0] + (precision[a] * (z - mean)[a] ** 2).sum() - (along**2 / values).sum()
     held = precision[a][precision[a] > 0]
     log_determinant = np.log(values).sum() + 2 * np.log(scale).sum()
     value = offset - 0.5 * square + 0.5 * np.log(held).sum() - 0.5 * log_determinant
@@ -67,14 +70,33 @@ def _half_spaces(
     reach = (centre[places] - bounds) / sd
     if len(places) == 1:
         mass = float(norm.logcdf(reach[0]))
-    elif reach.min() < -6:
-        mass = float(norm.logcdf(reach.min()))  # the most forbidden one alone decides, to leading order
     else:
         correlation = covariance[np.ix_(places, places)] / np.outer(sd, sd) + 1e-10 * np.eye(len(places))
-        joint = multivariate_normal.cdf(reach, cov=correlation, allow_singular=True, rng=np.random.default_rng(0))
-        mass = float(np.log(max(joint, _TINY)))
+        mass = _orthant(reach, correlation)
     prior = norm.logcdf((mean[places] - bounds) * np.sqrt(precision[places])).sum()
     return mass - float(prior)
+
+
+def _orthant(reach: np.ndarray, correlation: np.ndarray) -> float:
+    """Log probability that correlated standard normals all lie above minus `reach`.
+
+    Far out, where a cubature returns zero, one after the other given that those before are inside (Mendell and
+    Elston 1974).
+    """
+    if reach.min() >= _FAR:
+        joint = multivariate_normal.cdf(reach, cov=correlation, allow_singular=True, rng=np.random.default_rng(0))
+        return float(np.log(max(joint, _TINY)))
+    reach, covariance, total = reach.copy(), correlation.copy(), 0.0
+    for i in range(len(reach)):
+        spread = np.sqrt(covariance[i, i])
+        r = reach[i] / spread
+        total += float(norm.logcdf(r))
+        shift = float(np.exp(norm.logpdf(r) - norm.logcdf(r)))
+        with_i = covariance[:, i] / spread
+        reach = reach + with_i * shift
+        covariance = covariance - np.outer(with_i, with_i) * shift * (shift + r)
+        covariance += np.diag(np.maximum(1e-12 - np.diag(covariance), 0.0))
+    return total
 
 
 def variance_inflation(scores: Float[np.ndarray, "time z"], blocks: tuple[int, ...] = (12, 24, 48)) -> float:

@@ -120,7 +120,7 @@ def backward(linear: Linear, done: Pass, variances: Array, delta: Array) -> Smoo
         own: list[Array] = []
         for j in reversed(range(lin.H.shape[0])):
             h, seen = lin.H[j], r[j] > 0
-            u = jnp.where(seen, e[j] @ column / S[j] - K[j] @ adjoint, 0.0)
+            u = jnp.where(seen, e[j] @ column / S[j] + K[j] @ adjoint, 0.0)
             D = jnp.where(seen, 1 / S[j] + K[j] @ information @ K[j], 0.0)
             own = [r[j] ** 2 * u**2 + r[j] - r[j] ** 2 * D, *own]
             keep = jnp.eye(h.shape[0]) - jnp.outer(K[j], h)

@@ -10,7 +10,7 @@ import numpy as np
 from ._calibrate import Priors, grow
 from ._noisy import PathFit, fit_paths
 from ._problem import SLOTS, Combination
-from ._start import priors_without_effects, scales, typical_forces, windows
+from ._start import priors_without_effects, scales, typical_forces, windows, with_states
 from ._stochastic import run_filter
 from ._trajectory import Stepper
 from ._weighed import Estimate, weigh_coloured, weigh_white
@@ -68,7 +68,9 @@ class Search:
         self.null_paths = self._null_paths(bare)
         best = max(self.null_paths, key=lambda fit: fit.log_evidence)
         self.typical = typical_forces(self.problem, best.z, best.paths)
-        self.found.priors = replace(bare, scales=scales(self.problem, best.z, best.paths))
+        wide = with_states(self.problem, bare, best.paths)
+        self.found.priors = replace(wide, scales=scales(self.problem, best.z, best.paths))
+        self._add_paths(fit_paths(self.stepper, self.null_paths, self.found.priors, self.rows, 3))
         for size in range(1, SLOTS + 1):
             candidates = self._proposals(size)
             if not candidates or not self._in_time():
@@ -102,9 +104,7 @@ class Search:
         for share in _SHARES:
             start = PathFit((), self._intensity(share), self.seed, guess, first)
             starts.append(start)
-        fits = fit_paths(self.stepper, starts, priors, self.rows, self._path_steps)
-        self._add_paths(fits)
-        return fits
+        return fit_paths(self.stepper, starts, priors, self.rows, self._path_steps)
 
     def _intensity(self, share: float) -> np.ndarray:
         """Squared force times the time over which it would be felt: a tenth of the shortest recording's length."""

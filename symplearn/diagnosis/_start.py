@@ -16,6 +16,8 @@ _STARTS = 16
 _SPREADS = (1e-3, 0.1, 1.0, 10.0)
 # Prior scale of an effect: its force against the forces already there, or its error against the reading's spread.
 STRENGTH = 0.3
+# Where nothing is known: this many times the size of what was found.
+_WIDE = 10.0
 
 
 def priors_without_effects(problem: Problem) -> Priors:
@@ -27,8 +29,19 @@ def priors_without_effects(problem: Problem) -> Priors:
         inverse = np.where(problem.initial.sd > 0, problem.initial.sd, np.inf) ** -2.0
         precision[: problem.head] = np.tile(inverse, len(problem.rows))
         part = slice(problem.head, problem.head + c.size)
-        mean[part], precision[part] = c.mean, c.sd**-2.0
+        # A flat prior is a very wide one, so that no combination gains by losing sight of a parameter.
+        wide = np.where(c.mean != 0, _WIDE * np.abs(c.mean), np.inf)
+        mean[part], precision[part] = c.mean, np.where(np.isinf(c.sd), wide, c.sd) ** -2.0
     return Priors(mean, precision, np.full(len(problem.equations.candidates), np.inf))
+
+
+def with_states(problem: Problem, priors: Priors, paths: Sequence[Float[np.ndarray, "time state"]]) -> Priors:
+    """Very wide priors of unknown initial states, as large as the motion along given paths asks for."""
+    precision = priors.precision.copy()
+    size = np.sqrt(np.mean(np.concatenate(paths) ** 2, axis=0))
+    unknown = np.tile(np.isinf(problem.initial.sd) & (size > 0), len(problem.rows))
+    precision[: problem.head][unknown] = (_WIDE * np.tile(size, len(problem.rows))[unknown]) ** -2.0
+    return Priors(priors.mean, precision, priors.scales)
 
 
 def windows(rows: Sequence[int], fractions: Sequence[float], least: int) -> list[list[int]]:

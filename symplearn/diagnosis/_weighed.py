@@ -1,7 +1,6 @@
 """One combination of effects with its evidence under each kind of remainder."""
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -32,12 +31,6 @@ class Estimate:
     intensity: Float[np.ndarray, " d"] | None = None
     paths: list[np.ndarray] | None = field(default=None, repr=False)
     colours: tuple[Colour, ...] = ()
-
-
-class Kind(Protocol):
-    """A kind of remainder that turns fitted lanes into estimates."""
-
-    def __call__(self, problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -> list[Estimate]: ...
 
 
 def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -> list[Estimate]:

@@ -10,7 +10,7 @@ from .._errors import InputError, shown
 OUTPUTS = ("forecast.csv", "augmented.toml", "report.html", "diagnosis.json")
 
 
-def prepare_directory(path: Path) -> Path:
+def prepare_directory(path: str | Path) -> Path:
     """Makes the output folder and tries it with a file that is removed again.
 
     **Raises:** `InputError` where it is no folder, cannot be made or cannot be written.
