@@ -132,7 +132,8 @@ def calibrate(
         done |= stuck
         if count >= _PATIENCE:
             value = fits.cost + 2 * _log_noise(problem, fits.noise, weight)
-            stuck |= ~done & (value > np.nanmin(value) + 2 * _HOPELESS)
+            best = np.min(np.where(np.isnan(value), np.inf, value))
+            stuck |= ~done & (value > best + 2 * _HOPELESS)
             done |= stuck
     return replace(fits, converged=done & ~stuck & np.isfinite(fits.cost))
 

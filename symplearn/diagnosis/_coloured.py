@@ -134,11 +134,13 @@ def fit_colour(
     weight: list[Float[np.ndarray, " time"]],
     times: list[Float[np.ndarray, " time"]],
     known: float | None,
+    largest: float = np.inf,
 ) -> list[Colour]:
     """The best coloured error of one channel for every lane, all recordings together.
 
     **Arguments:** - `residuals`: by recording, in the reading's unit. - `known`: the white noise's sd where the file
-    gives it; None where it is profiled out.
+    gives it; None where it is profiled out. - `largest`: the largest sd of the coloured error; one as large as the
+    signal would explain everything and mean nothing.
     """
     grid = _grid(times)
     ratio, frequency, damping = (jnp.asarray(grid[:, i]) for i in range(3))
@@ -152,11 +154,10 @@ def fit_colour(
         square = square + np.concatenate([np.asarray(a) for a, _ in parts])[: len(x)]
         logs = logs + np.concatenate([np.asarray(b) for _, b in parts])[: len(x)]
         number += int((w[some] > 0).sum())
-    if known is None:
-        value = -0.5 * (number * np.log(np.maximum(square, 1e-300) / number) + logs)
-    else:
-        value = -0.5 * (square / known**2 + logs)
-    return [_chosen(grid, np.where(np.isfinite(v), v, -np.inf)) for v in value]
+    white = np.maximum(square, 1e-300) / number if known is None else np.full_like(square, known**2)
+    value = -0.5 * (number * np.log(white) + square / white + logs)
+    value = np.where(np.isfinite(value) & (grid[:, 0] * white <= largest**2), value, -np.inf)
+    return [_chosen(grid, v) for v in value]
 
 
 def _chosen(grid: np.ndarray, values: np.ndarray) -> Colour:

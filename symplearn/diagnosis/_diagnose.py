@@ -14,7 +14,7 @@ from . import _document as document
 from ._augment import augmented
 from ._build import Restriction, augmented_equations, build, first_substep, refined, rows_fitted
 from ._forecast import forecast, forecast_times
-from ._locate import explained, motion, strained_coordinates, strained_windows, where_sentence
+from ._locate import motion, strained_coordinates, strained_windows, where_sentence
 from ._outlook import Outlook, intensity_of
 from ._posterior import Posterior, Weighed, posterior
 from ._problem import Problem
@@ -55,6 +55,11 @@ def diagnose(file: SimulationFile, recordings: Sequence[Recording], options: Opt
 
     `InputError` where simulation and recordings do not fit together.
     """
+    with np.errstate(all="ignore"):  # what is not finite is told in the answer
+        return _diagnosed(file, recordings, options)
+
+
+def _diagnosed(file: SimulationFile, recordings: Sequence[Recording], options: Options) -> Diagnosis:
     begin = time.monotonic()
     options.progress("reading the equations of motion")
     times = _times_ahead(recordings[0], options)
@@ -189,7 +194,9 @@ class _Answer:
                 "rows": sum(r.given for r in self.problem.rows),
                 "used": sum(r.used for r in self.problem.rows),
             },
-            "converged": bool(self.after.converged and all(o.ok for o in self.with_)),
+            "converged": bool(
+                self.after.converged and all(o.ok and np.isfinite(o.readings).all() for o in self.with_)
+            ),
             "version": VERSION,
             "seed": self.options.seed,
             "seconds": round(seconds, 2),
@@ -261,7 +268,7 @@ class _Answer:
         moving = [one.place for one in chosen if one.effect.acts_on == "coordinate"]
         if not moving:
             return f"in the sensor of {', '.join(dict.fromkeys(one.target for one in chosen))}"
-        return where_sentence(self.problem, self.lens[0], moving[0], explained(self.lens[0], moving[0]))
+        return where_sentence(self.problem, self.lens[0], moving[0])
 
     def _unexplained_location(self) -> dict[str, Any]:
         eq, several = self.problem.equations, len(self.lens) > 1
@@ -273,7 +280,7 @@ class _Answer:
         else:
             strained = strained_coordinates(self.lens)
             kind, targets = "dynamics", [eq.coordinates[i] for i in strained]
-            where = where_sentence(self.problem, self.lens[0], strained[0], explained(self.lens[0], strained[0]))
+            where = where_sentence(self.problem, self.lens[0], strained[0])
             found = [(w, o.recording + 1) for o in self.lens for w in strained_windows(o, strained[0])]
             windows = [[*w, r] if several else w for w, r in found]
         numbers = list(range(1, len(self.lens) + 1))
@@ -288,6 +295,8 @@ class _Answer:
                        "they are sampled far above the motion's frequencies")  # fmt: skip
         if not self.after.converged:
             out.append("the fit did not converge; its numbers are not to be relied on")
+        if not all(np.isfinite(o.readings).all() for o in (*self.without, *self.with_)):
+            out.append("the simulated trajectory diverges: it leaves every bound before the recording ends")
         if not all(o.ok for o in (*self.without, *self.with_)):
             out.append("a filter step failed: the trajectory diverges from the recording, or is not finite")
         if not self.found.complete:

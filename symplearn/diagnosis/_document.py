@@ -62,7 +62,7 @@ def fit(
             density += outlook.held_out_log_density()
     with np.errstate(invalid="ignore", divide="ignore"):
         rmse = np.sqrt(squares / numbers)
-    held_out = bool((numbers > 0).any())
+    held_out = any((r.times > o.rows.boundary).any() for o, r in zip(outlooks, recordings, strict=True))
     intensity = np.zeros(len(momenta)) if needed.intensity is None else np.sqrt(needed.intensity)
     return {
         "holdout_rmse": {c: finite(x) for c, x in zip(columns, rmse, strict=True)} if held_out else None,

@@ -76,8 +76,9 @@ def strained_windows(outlook: Outlook, coordinate: int) -> list[list[float]]:
 def strained_coordinates(outlooks: Sequence[Outlook]) -> list[int]:
     """Coordinates whose equation is strained, the worst first; at least one."""
     level = np.mean([(o.strain() ** 2).mean(0) for o in outlooks], axis=0)
+    level = np.where(np.isfinite(level), level, 0.0)
     order = [int(i) for i in np.argsort(level)[::-1]]
-    return [i for i in order if level[i] > 0.5 * level[order[0]]]
+    return [i for i in order if level[i] >= 0.5 * level[order[0]]]
 
 
 def kind_and_targets(problem: Problem, combination: Combination) -> tuple[str, list[str]]:
@@ -97,9 +98,12 @@ def whole_windows(outlooks: Sequence[Outlook]) -> list[list[float]]:
     return spans
 
 
-def where_sentence(problem: Problem, outlook: Outlook, coordinate: int, shares: Explained) -> str:
+def where_sentence(problem: Problem, outlook: Outlook, coordinate: int) -> str:
     """What the missing force goes with."""
     name = problem.equations.coordinates[coordinate]
+    if not np.isfinite(outlook.missing_force()).all():
+        return f"the simulation of {name} diverges from the recording, so that no missing force can be followed"
+    shares = explained(outlook, coordinate)
     speed, place = (f"{100 * max(0.0, x):.0f} %" for x in (shares.speed, shares.place))
     alone = [word for word, share in (("its speed", shares.speed), ("its place", shares.place)) if share > 0.6]
     goes = alone[0] if alone else "both its speed and its place"

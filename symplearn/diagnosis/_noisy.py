@@ -49,6 +49,7 @@ def fit_paths(
         return [fit for chunk in done for fit in chunk]
 
 
+@np.errstate(all="ignore")  # a lane that diverged is told by its evidence
 def _fit_chunk(stepper, fits: list[PathFit], priors: Priors, rows: Sequence[int], iterations: int) -> list[PathFit]:
     wanted = len(fits)
     fits = (fits * LANES)[:LANES] if wanted < LANES else fits

@@ -84,7 +84,8 @@ class Outlook:
     def readings(self) -> Float[np.ndarray, "time channel"]:
         """Filtered readings over the fitted rows, then the free run."""
         last = self.rows.fitted - 1
-        return np.concatenate([self.followed[:last], self._run(self.last_state, last)[0]])
+        whole = np.concatenate([self.followed[:last], self._run(self.last_state, last)[0]])
+        return np.where(np.isfinite(whole), whole, np.nan)
 
     @cached_property
     def followed(self) -> Float[np.ndarray, "fitted channel"]:
@@ -109,6 +110,8 @@ class Outlook:
     def held_out_errors(self, times: np.ndarray, readings: np.ndarray) -> Float[np.ndarray, "row channel"]:
         """Readings minus the free run at original times after the last fitted row; NaN where nothing was read."""
         run = self.readings[self.rows.fitted - 1 :]
+        if not np.isfinite(run).all():
+            return np.full_like(readings, np.nan)
         return (
             readings - CubicSpline(self.rows.times[self.rows.fitted - 1 :], run)(times)
             if len(run) > 3

@@ -53,6 +53,8 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     remainder = 1.0 / len(families)
     factor = 1.0 / max(1.0, inflation)
     top = max(e.log_evidence for es in found.estimates.values() for e in es)
+    if not np.isfinite(top):
+        return Posterior(0.0, 1.0, (), _speaker(found.estimates[()]), {(): -np.inf}, factor)
     white, other, named = -np.inf, -np.inf, []
     evidences: dict[Combination, float] = {}
     for combination, estimates in found.estimates.items():
@@ -63,7 +65,7 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
         evidences[combination] = total if combination else max(plain, noisy)
         if not combination:
             white, other = plain, noisy
-        elif _informed(problem, found, combination):
+        elif any(e.converged for e in estimates) and _informed(problem, found, combination):
             weight = float(np.log([price[c] for c in combination]).sum())
             named.append((combination, weight, total, _speaker(estimates)))
     logs = np.array([white, np.log(remainder) + other, *(w + total for _, w, total, _ in named)])

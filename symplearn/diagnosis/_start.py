@@ -38,8 +38,8 @@ def priors_without_effects(problem: Problem) -> Priors:
 def with_states(problem: Problem, priors: Priors, paths: Sequence[Float[np.ndarray, "time state"]]) -> Priors:
     """Very wide priors of unknown initial states, as large as the motion along given paths asks for."""
     precision = priors.precision.copy()
-    size = np.sqrt(np.mean(np.concatenate(paths) ** 2, axis=0))
-    unknown = np.tile(np.isinf(problem.initial.sd) & (size > 0), len(problem.rows))
+    size = np.array([_rms(column) for column in np.concatenate(paths).T])
+    unknown = np.tile(np.isinf(problem.initial.sd), len(problem.rows))
     precision[: problem.head][unknown] = (_WIDE * np.tile(size, len(problem.rows))[unknown]) ** -2.0
     return Priors(priors.mean, precision, priors.scales)
 
@@ -103,11 +103,14 @@ def scales(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarray, "t
 def typical_forces(problem: Problem, z: np.ndarray, paths: Sequence[np.ndarray]) -> np.ndarray:
     """Root mean square of dp/dt along given paths, by momentum."""
     force = _along(problem, z, paths, problem.equations.slope)
-    return np.sqrt((force**2).mean(0))
+    return np.array([_rms(column) for column in force.T])
 
 
 def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    """Root mean square of the finite values; 1 where there is none, or none but zeros."""
+    square = values[np.isfinite(values)] ** 2
+    mean = float(np.sqrt(square.mean())) if square.size else 1.0
+    return mean if np.isfinite(mean) and mean > 0 else 1.0
 
 
 def _along(problem: Problem, z: np.ndarray, paths: Sequence[np.ndarray], function) -> np.ndarray:

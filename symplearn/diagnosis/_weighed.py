@@ -11,6 +11,9 @@ from ._evidence import Laplace, laplace, variance_inflation
 from ._problem import Combination, Problem
 from ._trajectory import Stepper
 
+# A remainder of the sensor is smaller than this share of what it reads; else it is the signal.
+_REMAINDER = 0.3
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -70,7 +73,8 @@ def weigh_coloured(problem: Problem, fits: Fits, priors: Priors, rows: list[int]
     chosen: list[list[Colour]] = []
     for j in range(problem.channels):
         known = None if np.isnan(problem.noise[j]) else float(problem.noise[j])
-        colours = fit_colour([x[..., j] for x in r], [w[:, j] for w in weight], times, known)
+        spread = float(np.nanstd(np.concatenate([rows_.readings[:, j] for rows_ in problem.rows])))
+        colours = fit_colour([x[..., j] for x in r], [w[:, j] for w in weight], times, known, _REMAINDER * spread)
         chosen.append(colours)
         for k in range(len(times)):
             gram, log = _channel_gram(problem, fits, r[k][..., j], weight[k][:, j], times[k], colours, k, j)
