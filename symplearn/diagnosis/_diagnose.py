@@ -17,7 +17,7 @@ from ._forecast import forecast, forecast_times
 from ._locate import motion, strained_coordinates, strained_windows, where_sentence
 from ._outlook import Outlook, intensity_of
 from ._posterior import Posterior, Weighed, posterior
-from ._problem import Problem
+from ._problem import Combination, Problem
 from ._record import Diagnosis, Forecast, Series
 from ._search import Found, Search
 from ._start import STRENGTH, first_fits, priors_without_effects
@@ -103,9 +103,12 @@ class _Answer:
         self.times = times
         self.file, self.recordings, self.stepper, self.found, self.options = file, recordings, stepper, found, options
         self.problem: Problem = stepper.problem
-        self.inflation = self._inflation()
-        self.posterior: Posterior = posterior(self.problem, found, self.inflation)
+        self.posterior: Posterior = posterior(self.problem, found, 1.0)
         self.chosen, self.verdict = self._verdict()
+        inflation = self._inflation()
+        if inflation > 1:
+            self.posterior = posterior(self.problem, found, inflation)
+            self.chosen, self.verdict = self._verdict()
         self.before: Estimate = self.posterior.nothing
         self.after: Estimate = self.chosen.best if self.chosen else self.before
         # Shown before: the calibrated simulation as it is, which knows no missing force.
@@ -117,8 +120,9 @@ class _Answer:
         self.lens_after = self._lenses(self.after)
 
     def _inflation(self) -> float:
+        """How much the evidence of the likeliest answer claims too much."""
         rows = rows_fitted(self.problem.rows)
-        top = max((e for es in self.found.estimates.values() for e in es), key=lambda e: e.log_evidence)
+        top = self.chosen.best if self.chosen else self.posterior.nothing
         return coloured_inflation(self.stepper, top, rows) if top.kind == "coloured" else max(1.0, top.inflation)
 
     def _verdict(self) -> tuple[Weighed | None, str]:
@@ -171,8 +175,7 @@ class _Answer:
         p, spread = self.posterior, self._spread()
         rows, other = document.alternatives(self.problem, p, self.verdict, self.chosen)
         before = document.fit(self.problem, self.pull or self.before, self.without, self.recordings)
-        needed = self.found.of(self.after.combination, "force") or self.after
-        after = document.fit(self.problem, needed, self.with_, self.recordings) if self.chosen else before
+        after = document.fit(self.problem, self.after, self.with_, self.recordings) if self.chosen else before
         return {
             "schema": "symplearn.diagnosis/1",
             "verdict": self.verdict,
@@ -237,10 +240,17 @@ class _Answer:
             "family": one.effect.family,
             "recordings": list(range(1, len(self.recordings) + 1)),
             "probability": document.presence(p, candidate),
-            "log_bayes_factor": document.finite(p.evidences[self.after.combination] - p.evidences.get(rest, -np.inf)),
+            "log_bayes_factor": self._against(rest),
             "coefficients": {one.effect.coefficient: value},
             "sentence": sentence,
         }
+
+    def _against(self, rest: Combination) -> float | None:
+        """Log Bayes factor against a smaller combination; against nothing at all where that one cannot be fitted."""
+        mine, without = (self.posterior.evidences.get(c, -np.inf) for c in (self.after.combination, rest))
+        if not np.isfinite(without):
+            without = self.posterior.evidences[()]
+        return document.finite(mine - without)
 
     def _strength(self, candidate: int, value: float) -> float:
         """Root mean square of an effect's force over that of the forces already there."""

@@ -36,7 +36,7 @@ def coefficient(problem: Problem, estimate: Estimate, slot: int, inflation: floa
 def parameters(problem: Problem, estimate: Estimate, inflation: float) -> dict[str, Any]:
     """Posterior of everything calibrated."""
     part = slice(problem.head, problem.head + problem.calibrated.size)
-    sd = np.sqrt(np.diag(estimate.covariance)[part] * inflation)
+    sd = np.minimum(np.sqrt(np.diag(estimate.covariance)[part] * inflation), problem.calibrated.sd)
     return {
         name: {"mean": float(m), "sd": float(s)}
         for name, m, s in zip(problem.calibrated.names, estimate.z[part], sd, strict=True)
@@ -48,8 +48,8 @@ def fit(
 ) -> dict[str, Any]:
     """Held-out error of the free run in the columns' units, its log density, and the noises.
 
-    Free run and density are those of `outlooks`. `needed` is the same hypothesis with a missing force beside it: the
-    process noise and the reading noise that it takes to follow the fitted rows.
+    Free run and density are those of `outlooks`. `needed` holds the process noise and the reading noise that it takes
+    to follow the fitted rows.
     """
     columns, momenta = problem.equations.columns, problem.equations.momenta
     squares, numbers, density = np.zeros(len(columns)), np.zeros(len(columns)), 0.0

@@ -75,8 +75,8 @@ class Search:
             candidates = self._proposals(size)
             if not candidates or not self._in_time():
                 break
-            named = "single effects" if size == 1 else f"combinations of {size} effects"
-            self.progress(f"weighing {len(candidates)} {named}")
+            single = f"the simulation as it is and {len(candidates) - 1} single effects"
+            self.progress(f"weighing {single if size == 1 else f'{len(candidates)} combinations of {size} effects'}")
             self._weigh(candidates)
             self._exchange(size)
             if size > 1 and self._long and not self._gained(size):
@@ -212,8 +212,8 @@ class Search:
     def _weigh_subsets(self) -> None:
         """What the best combinations become without each of their members, where that was not weighed yet."""
         ranked = sorted((c for c in self.found.estimates if c), key=self.found.best, reverse=True)[:_KEPT]
-        less = {c[:k] + c[k + 1 :] for c in ranked for k in range(len(c))}
-        missing = sorted(c for c in less if c and c not in self.found.estimates)
+        less = dict.fromkeys(c[:k] + c[k + 1 :] for c in ranked for k in range(len(c)))
+        missing = [c for c in less if c and c not in self.found.estimates]
         if missing:
             self._weigh(missing[:_KEPT])
 
