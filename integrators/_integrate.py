@@ -126,9 +126,7 @@ def strongly_typed(tree: Any) -> Any:
 
 
 @eqx.filter_jit
-def _integrate(
-    system: System, integrator: AbstractIntegrator, x0: Array, ts: Array, substeps: int
-) -> Trajectory:
+def _integrate(system: System, integrator: AbstractIntegrator, x0: Array, ts: Array, substeps: int) -> Trajectory:
     def interval(state: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         state = advance(system, integrator, state, *ends, substeps)
         return state, integrator.project(state)

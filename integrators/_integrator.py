@@ -98,9 +98,7 @@ class AbstractIntegrator(eqx.Module):
         points = state.reshape(self.copies, -1)
         return jax.vmap(lambda x: system.kick(x, t, dt))(points).reshape(-1)
 
-    def _hold(
-        self, system: Forced, start: Float[Array, " n"], end: Float[Array, " n"], t: Time
-    ) -> Float[Array, " n"]:
+    def _hold(self, system: Forced, start: Float[Array, " n"], end: Float[Array, " n"], t: Time) -> Float[Array, " n"]:
         """Keeps a coordinate that friction holds where it was.
 
         Splitting alone lets a stuck body creep, at a speed of order dt |dU/dq| / m: the flow moves it a

@@ -64,9 +64,7 @@ def read_columns(
     except FileNotFoundError:
         raise InputError(f"{name}: no such file; give the path of a recording (CSV)") from None
     except (gzip.BadGzipFile, EOFError, zlib.error):
-        raise InputError(
-            f"{name}: is not a complete gzip file; compress it again or give the CSV itself"
-        ) from None
+        raise InputError(f"{name}: is not a complete gzip file; compress it again or give the CSV itself") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{name}: cannot be read ({reason}); give the path of a recording (CSV)") from None
@@ -81,9 +79,7 @@ def _opened(path: str | Path) -> io.TextIOWrapper:
 class _Reader:
     """Reads one file."""
 
-    def __init__(
-        self, name: str, numbers: Sequence[str], texts: Sequence[str], where: Mapping[str, str | float]
-    ):
+    def __init__(self, name: str, numbers: Sequence[str], texts: Sequence[str], where: Mapping[str, str | float]):
         self.name, self.where = name, where
         self.numbers, self.texts = list(dict.fromkeys(numbers)), list(dict.fromkeys(texts))
         self.line = 0
@@ -141,9 +137,7 @@ class _Reader:
     def advice(self, needed: str, header: list[str]) -> str:
         for separator, word in ((";", "semicolons"), ("\t", "tabs")):
             if any(separator in cell for cell in header):
-                return (
-                    f"cells seem to be separated by {word}; use commas between cells and a point in numbers"
-                )
+                return f"cells seem to be separated by {word}; use commas between cells and a point in numbers"
         return nearest(needed, [cell for cell in header if cell])
 
     def chunks(self, rows: Iterator[list[str]], width: int) -> Iterator[tuple[list[list[str]], list[int]]]:
@@ -162,11 +156,7 @@ class _Reader:
             return False
         if len(row) == width:
             return True
-        advice = (
-            "is a comma used as the decimal mark?"
-            if len(row) > width
-            else "an empty cell still needs its comma"
-        )
+        advice = "is a comma used as the decimal mark?" if len(row) > width else "an empty cell still needs its comma"
         cells = f"{len(row)} cell{'s' if len(row) != 1 else ''}"
         raise InputError(f"{self.name}, line {line}: {cells} where the header has {width}; {advice}")
 
@@ -216,11 +206,7 @@ class _Reader:
         """What is wrong with a cell that is no finite number."""
         text = cell.strip()
         advice = "give a number (a missing reading is an empty cell)"
-        if (
-            text.lower().lstrip("+-") in ("inf", "infinity")
-            or frozenset(text) <= _NUMERIC
-            and _is_float(text)
-        ):
+        if text.lower().lstrip("+-") in ("inf", "infinity") or frozenset(text) <= _NUMERIC and _is_float(text):
             what = "is not finite"
         else:
             what = "is not a number"

@@ -36,9 +36,7 @@ _ADVICE = {
     "'": "text in quotes is not part of an expression",
     '"': "text in quotes is not part of an expression",
     ";": "an expression is a single formula",
-    **dict.fromkeys(
-        "<>=!", "comparisons and assignments are not part of an expression; use min, max, abs or sign"
-    ),
+    **dict.fromkeys("<>=!", "comparisons and assignments are not part of an expression; use min, max, abs or sign"),
 }
 
 
@@ -71,17 +69,13 @@ def parse_expression(text: str, names: Collection[str], *, where: str) -> sympy.
     **Raises** `InputError` for anything else, naming the character (counted from 1) where it stands.
     """
     if len(text) > LONGEST:
-        raise InputError(
-            f"{where}: the expression has {len(text):,} characters; at most {LONGEST:,} are read"
-        )
+        raise InputError(f"{where}: the expression has {len(text):,} characters; at most {LONGEST:,} are read")
     _check_depth(text, where)
     try:
         with _deep_recursion():
             return _Parser(text, names, where).whole()
     except RecursionError:
-        raise InputError(
-            f"{where}: the expression is nested too deeply to work with; nest less deeply"
-        ) from None
+        raise InputError(f"{where}: the expression is nested too deeply to work with; nest less deeply") from None
 
 
 @contextmanager
@@ -118,9 +112,7 @@ def _tokens(text: str, where: str) -> Iterator[_Token]:
         match = _TOKEN.match(text, index)
         if match is None:
             character = text[index]
-            advice = _ADVICE.get(
-                character, "an expression holds names, numbers, + - * / **, brackets and commas"
-            )
+            advice = _ADVICE.get(character, "an expression holds names, numbers, + - * / **, brackets and commas")
             raise InputError(f"{where}: unexpected {shown(character)} at character {index + 1}; {advice}")
         kind = match.lastgroup or ""
         if kind != "space":
@@ -150,9 +142,7 @@ class _Parser:
         return token
 
     def refuse(self, token: _Token, what: str, advice: str = "") -> Never:
-        raise InputError(
-            f"{self.where}: {what} at character {token.position}" + (f"; {advice}" if advice else "")
-        )
+        raise InputError(f"{self.where}: {what} at character {token.position}" + (f"; {advice}" if advice else ""))
 
     def whole(self) -> sympy.Expr:
         if self.token.kind == "end":
@@ -160,9 +150,7 @@ class _Parser:
         result = self.sum()
         token = self.token
         if token.kind in ("name", "number") or token.text == "(":
-            self.refuse(
-                token, f"an operator is missing before {shown(token.text)}", "a product is written with *"
-            )
+            self.refuse(token, f"an operator is missing before {shown(token.text)}", "a product is written with *")
         if token.kind != "end":
             self.refuse(token, f"unexpected {shown(token.text)}")
         return result
@@ -185,9 +173,7 @@ class _Parser:
         while operator := self.take("+", "-"):
             term = self.product()
             terms.append(
-                self.built(operator, _tree.product, (sympy.S.NegativeOne, term))
-                if operator.text == "-"
-                else term
+                self.built(operator, _tree.product, (sympy.S.NegativeOne, term)) if operator.text == "-" else term
             )
         return self.built(first, _tree.total, terms)
 
@@ -236,9 +222,7 @@ class _Parser:
         if self.take(")"):
             self.depth -= 1
         elif token.kind in ("name", "number") or token.text == "(":
-            self.refuse(
-                token, f"an operator is missing before {shown(token.text)}", "a product is written with *"
-            )
+            self.refuse(token, f"an operator is missing before {shown(token.text)}", "a product is written with *")
         elif token.kind == "end":
             self.refuse(opening, "a bracket is never closed, the one opened")
         else:

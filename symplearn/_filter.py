@@ -46,9 +46,7 @@ class UnscentedTransform(eqx.Module):
     def spread(self, dim: int) -> float:
         """d + lambda = alpha^2 (d + kappa), the squared stretch of the sigma points."""
         if dim + self.kappa <= 0:
-            raise ValueError(
-                f"`UnscentedTransform` needs dim + kappa > 0, but dim={dim}, kappa={self.kappa}."
-            )
+            raise ValueError(f"`UnscentedTransform` needs dim + kappa > 0, but dim={dim}, kappa={self.kappa}.")
         return self.alpha**2 * (dim + self.kappa)
 
     def offsets(self, covariance: Float[Array, "state state"]) -> Float[Array, "point state"]:

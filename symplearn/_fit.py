@@ -74,9 +74,7 @@ def fit(
     prior = prior if isinstance(prior, Prior) else Prior(prior)
     series = as_time_series(recording)
     if not named_parameters(model):
-        raise InputError(
-            "Nothing in the model learns: every number is known or `Frozen`. Wrap one in `Positive`."
-        )
+        raise InputError("Nothing in the model learns: every number is known or `Frozen`. Wrap one in `Positive`.")
     posterior, likelihood, slope = _at(model, series, objective, prior)
     if not bool(jnp.isfinite(posterior)):
         raise InputError(
@@ -129,9 +127,7 @@ def _descend(model, series, objective, prior, scale, max_steps):
     start, rebuild = flatten(model)
     score = guarded(lambda free: negative_log_posterior(rebuild(free), series, objective, prior), start.size)
     solver: Any = ox.BestSoFarMinimiser(ox.BFGS(rtol=1e-10, atol=1e-10))
-    solution: Any = ox.minimise(
-        lambda free, _: scale * score(free), solver, start, max_steps=max_steps, throw=False
-    )
+    solution: Any = ox.minimise(lambda free, _: scale * score(free), solver, start, max_steps=max_steps, throw=False)
     inverse = scale * solution.state.state.f_info.hessian_inv.as_matrix()
     return rebuild(solution.value), inverse, solution.stats["num_steps"]
 

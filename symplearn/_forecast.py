@@ -49,9 +49,7 @@ def forecast(estimate: Estimate, *, until: float | None = None, times: Any = Non
     **Raises:** `InputError` where not exactly one is given, times do not lie ahead, or the forecast is not
     finite.
     """
-    objective = (
-        estimate.objective if isinstance(estimate.objective, MarginalLikelihood) else MarginalLikelihood()
-    )
+    objective = estimate.objective if isinstance(estimate.objective, MarginalLikelihood) else MarginalLikelihood()
     recorded = np.asarray(estimate.recording.times)
     ahead = _times_ahead(recorded, until, times)
     filtered = objective.filter(estimate.model, estimate.recording)
@@ -59,9 +57,7 @@ def forecast(estimate: Estimate, *, until: float | None = None, times: Any = Non
     start = filtered.filtered_means[-1], filtered.filtered_covariances[-1]
     result = _push_forward(resolve(estimate.model), objective.transform, grid, *start)
     if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in (*jax.tree.leaves(result), *start)):
-        raise InputError(
-            f"The forecast is not finite before t = {ahead[-1]:g}: the model escapes. Forecast less far."
-        )
+        raise InputError(f"The forecast is not finite before t = {ahead[-1]:g}: the model escapes. Forecast less far.")
     return result
 
 
@@ -76,8 +72,7 @@ def _times_ahead(recorded: np.ndarray, until: float | None, times: Any) -> np.nd
     ahead = np.asarray(times, dtype=float)
     if ahead.ndim != 1 or len(ahead) == 0 or not np.all(np.diff(np.concatenate([[last], ahead])) > 0):
         raise InputError(
-            f"A forecast needs increasing times after the recording's last, {last:g}; one interval is "
-            f"{spacing:g}."
+            f"A forecast needs increasing times after the recording's last, {last:g}; one interval is {spacing:g}."
         )
     return ahead
 

@@ -40,9 +40,7 @@ def as_time_series(recording: Any) -> TimeSeries:
             f"{times.shape} and {readings.shape}."
         )
     if not np.all(np.isfinite(times)) or not np.all(np.diff(times) > 0):
-        raise InputError(
-            "The times of a recording must be finite and strictly increasing; sort or clean them first."
-        )
+        raise InputError("The times of a recording must be finite and strictly increasing; sort or clean them first.")
     if np.any(np.isinf(readings)):
         raise InputError("A recording has infinite readings; give NaN where a reading is missing.")
     return TimeSeries(jnp.asarray(times), jnp.asarray(readings))
@@ -95,9 +93,7 @@ def prepare(model: StateSpaceModel, series: TimeSeries) -> tuple[StateSpaceModel
         )
     readings = series.readings
     if model.initial is None:
-        model = eqx.tree_at(
-            lambda m: m.initial, model, _given_first(model, readings[0], noise), is_leaf=_is_none
-        )
+        model = eqx.tree_at(lambda m: m.initial, model, _given_first(model, readings[0], noise), is_leaf=_is_none)
         readings = readings.at[0].set(jnp.nan)
     return model, readings, intervals_between(series.times)
 
@@ -114,7 +110,5 @@ def _given_first(model: StateSpaceModel, reading: Array, noise: Array) -> Gaussi
             "`initial=Gaussian(mean, covariance)`."
         )
     if not isinstance(reading, jax.core.Tracer) and bool(jnp.any(jnp.isnan(reading))):
-        raise InputError(
-            "The first row has missing readings; give the model `initial=Gaussian(mean, covariance)`."
-        )
+        raise InputError("The first row has missing readings; give the model `initial=Gaussian(mean, covariance)`.")
     return Gaussian(reading, noise)

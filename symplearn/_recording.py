@@ -74,20 +74,14 @@ def _parts(simulation: SimulationFile, path: str | Path) -> Iterator[_Part]:
     name = shown(Path(path).name, 200)[1:-1]
     if len(columns.lines) == 0:
         wanted = ", ".join(f"{column} = {value}" for column, value in section.where.items())
-        advice = (
-            f"none has {shown(wanted)}; correct `where`"
-            if wanted
-            else "give rows of numbers below the header"
-        )
+        advice = f"none has {shown(wanted)}; correct `where`" if wanted else "give rows of numbers below the header"
         raise InputError(f"{name}: has no rows that are used; {advice}")
     for group, rows in _groups(section.group, columns, name):
         told = ", ".join(f"{column} {value}" for column, value in zip(section.group, group, strict=True))
         yield _Part(f"{name} ({shown(told, 80)[1:-1]})" if told else name, group, columns, rows)
 
 
-def _groups(
-    names: Sequence[str], columns: Columns, file: str
-) -> Iterator[tuple[tuple[str, ...], np.ndarray]]:
+def _groups(names: Sequence[str], columns: Columns, file: str) -> Iterator[tuple[tuple[str, ...], np.ndarray]]:
     """Group values in the order met, with the rows of each."""
     if not names:
         yield (), np.arange(len(columns.lines))
@@ -97,13 +91,10 @@ def _groups(
     of_row = np.array([codes.setdefault(cell, len(codes)) for cell in cells])
     for group, code in codes.items():
         rows = np.flatnonzero(of_row == code)
-        empty = next(
-            (name for name, cell in zip(names, group, strict=True) if cell.lower() in ("", "nan")), None
-        )
+        empty = next((name for name, cell in zip(names, group, strict=True) if cell.lower() in ("", "nan")), None)
         if empty is not None:
             raise InputError(
-                f"{file}, line {columns.lines[rows[0]]}, column {shown(empty)}: no group is given; "
-                "every row needs one"
+                f"{file}, line {columns.lines[rows[0]]}, column {shown(empty)}: no group is given; every row needs one"
             )
         yield group, rows
 
@@ -165,8 +156,7 @@ def _used(times: np.ndarray, readings: np.ndarray, start: float, end: float, nam
     seen = inside[np.isfinite(readings[inside]).any(axis=1)]
     if len(seen) == 0:
         raise InputError(
-            f"{name}: all readings of the rows used are missing; "
-            "give rows with readings, or correct start and end"
+            f"{name}: all readings of the rows used are missing; give rows with readings, or correct start and end"
         )
     return slice(inside[0], seen[-1] + 1)
 

@@ -24,9 +24,7 @@ def check_times(times: np.ndarray, lines: np.ndarray, column: str, name: str) ->
     missing = np.isnan(times)
     if missing.any():
         line = lines[np.argmax(missing)]
-        raise InputError(
-            f"{name}, line {line}, column {shown(column)}: the time is missing; give a time in every row"
-        )
+        raise InputError(f"{name}, line {line}, column {shown(column)}: the time is missing; give a time in every row")
     late = np.diff(times) <= 0
     if late.any():
         row = int(np.argmax(late)) + 1
@@ -46,8 +44,7 @@ def check_recordings(simulation: SimulationFile, recordings: Sequence[_Rows]) ->
     if not any(_moves(r.readings) for r in recordings):
         told = ", ".join(map(shown, simulation.recording.observe))
         raise InputError(
-            f"{_names(recordings)}: nothing moves, every reading of {told} is constant; "
-            "give a recording of a motion"
+            f"{_names(recordings)}: nothing moves, every reading of {told} is constant; give a recording of a motion"
         )
 
 

@@ -14,6 +14,8 @@ from ._thinning import Thinned, thin, thinning_width
 
 # A gap this much wider than the usual one is bridged by rows without readings, so that one substep fits all spans.
 _WIDE = 1.5
+# Fitted rows of one recording beyond which the first ones are left out; the last ones lead up to the held-out part.
+_LONGEST = 15_000
 
 
 @runtime_checkable
@@ -52,12 +54,15 @@ class Rows:
         return jnp.asarray(self.times), jnp.asarray(self.inputs)
 
 
-def lay_out(recordings: Sequence[HasRows], holdout: float, width: float, substep: float) -> list[Rows]:
+def lay_out(
+    recordings: Sequence[HasRows], holdout: float, width: float, substep: float, shorten: bool = False
+) -> list[Rows]:
     """Thin recordings into bins of `width`, split off the held-out parts, and lay spans of at most `substep`.
 
-    All recordings get the same number of substeps per span, so that one compiled function serves them all.
+    All recordings get the same number of substeps per span, so that one compiled function serves them all. `shorten`
+    leaves out the first rows of a recording that holds more than can be fitted in minutes, even after thinning.
     """
-    thinned = [_thinned(recording, holdout, width) for recording in recordings]
+    thinned = [_thinned(recording, holdout, width, shorten) for recording in recordings]
     pieces = max(math.ceil(np.median(np.diff(rows.times)) / substep - 1e-9) for rows, _ in thinned)
     return [
         _one(recording, rows, first, max(1, pieces), holdout)
@@ -69,11 +74,13 @@ def _fitted_count(n: int, holdout: float) -> int:
     return max(n - math.floor(n * holdout + 1e-9), 2)
 
 
-def _thinned(recording: HasRows, holdout: float, width: float) -> tuple[Thinned, int]:
+def _thinned(recording: HasRows, holdout: float, width: float, shorten: bool) -> tuple[Thinned, int]:
     """Fitted and held-out rows thinned apart, end to end, and how many of them are fitted."""
     n = len(recording.times)
     keep = _fitted_count(n, holdout)
     parts = [thin(recording.times[a:b], recording.readings[a:b], width) for a, b in ((0, keep), (keep, n)) if b > a]
+    late = slice(max(0, len(parts[0].times) - _LONGEST) if shorten else 0, None)
+    parts[0] = Thinned(parts[0].times[late], parts[0].readings[late], parts[0].counts[late])
     joined = (np.concatenate([getattr(part, f) for part in parts]) for f in ("times", "readings", "counts"))
     return Thinned(*joined), len(parts[0].times)
 

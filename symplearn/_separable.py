@@ -13,9 +13,7 @@ _MOST_TERMS = 300  # of an expanded expression
 _MOST_OPERATIONS = 150  # of a derivative that is handed to SymPy's `simplify`
 
 
-def is_separable(
-    hamiltonian: sympy.Expr, q_symbols: Sequence[sympy.Symbol], p_symbols: Sequence[sympy.Symbol]
-) -> bool:
+def is_separable(hamiltonian: sympy.Expr, q_symbols: Sequence[sympy.Symbol], p_symbols: Sequence[sympy.Symbol]) -> bool:
     """True where H = T(p) + U(q): every mixed derivative d2H / dq dp is identically zero.
 
     False where that could not be shown with bounded work: a step that serves any H is then never wrong.

@@ -58,8 +58,7 @@ def _check_names(table: SimulationTable, file: str) -> None:
         _check_name(name, f"{file}, {section}")
         if name in seen:
             raise InputError(
-                f"{file}, {section}: {shown(name)} is declared already in {seen[name]}; "
-                "declare every name once"
+                f"{file}, {section}: {shown(name)} is declared already in {seen[name]}; declare every name once"
             )
         seen[name] = section
 
@@ -81,15 +80,11 @@ def _hamiltonian(system: SystemSection, names: Collection[str], states: list[str
     where = f"{file}, [system] hamiltonian"
     hamiltonian = _expression(system.hamiltonian, names, where)
     if not hamiltonian.tree.free_symbols & set(map(symbol, states)):
-        raise InputError(
-            f"{where}: depends on no coordinate and no momentum; write the energy as a function of them"
-        )
+        raise InputError(f"{where}: depends on no coordinate and no momentum; write the energy as a function of them")
     return hamiltonian
 
 
-def _quantities(
-    entries: Mapping[str, float | CalibratedTable], section: str, file: str
-) -> dict[str, Quantity]:
+def _quantities(entries: Mapping[str, float | CalibratedTable], section: str, file: str) -> dict[str, Quantity]:
     return {n: quantity(e, f"{file}, {place([section, n])}") for n, e in entries.items()}
 
 
@@ -115,19 +110,13 @@ def _forces(table: SimulationTable, names: Collection[str], file: str) -> dict[s
     return forces
 
 
-def _recording(
-    table: RecordingTable, names: Collection[str], states: list[str], file: str
-) -> RecordingSection:
-    group = (
-        () if table.group is None else (table.group,) if isinstance(table.group, str) else tuple(table.group)
-    )
+def _recording(table: RecordingTable, names: Collection[str], states: list[str], file: str) -> RecordingSection:
+    group = () if table.group is None else (table.group,) if isinstance(table.group, str) else tuple(table.group)
     _check_columns(table, group, file)
     _check_window(table, group, file)
     return RecordingSection(
         time=table.time,
-        observe={
-            column: _observed(column, text, names, states, file) for column, text in table.observe.items()
-        },
+        observe={column: _observed(column, text, names, states, file) for column, text in table.observe.items()},
         noise=_noise(table, file),
         inputs=tuple(table.inputs),
         interpolation=table.interpolation,
@@ -155,14 +144,11 @@ def _check_columns(table: RecordingTable, group: tuple[str, ...], file: str) -> 
         for column in columns:
             if column in uses:
                 raise InputError(
-                    f"{file}, [recording] {key}: {shown(column)} is already {uses[column]}; "
-                    "use another column"
+                    f"{file}, [recording] {key}: {shown(column)} is already {uses[column]}; use another column"
                 )
             uses[column] = "observed"
     if table.time in table.inputs:
-        raise InputError(
-            f"{file}, [recording] inputs: {shown(table.time)} is the column of times; write t for it"
-        )
+        raise InputError(f"{file}, [recording] inputs: {shown(table.time)} is the column of times; write t for it")
 
 
 def _check_window(table: RecordingTable, group: tuple[str, ...], file: str) -> None:
@@ -174,9 +160,7 @@ def _check_window(table: RecordingTable, group: tuple[str, ...], file: str) -> N
             )
     start, end = table.start, table.end
     if isinstance(start, float) and isinstance(end, float) and not start < end:
-        raise InputError(
-            f"{file}, [recording] end: {end:g} is not after start = {start:g}; give a later time"
-        )
+        raise InputError(f"{file}, [recording] end: {end:g} is not after start = {start:g}; give a later time")
 
 
 def _noise(table: RecordingTable, file: str) -> dict[str, float]:

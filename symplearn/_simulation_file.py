@@ -40,37 +40,25 @@ def _text(path: str | Path, name: str) -> str:
         raise InputError(f"{name}: no such file; give the path of a simulation file (TOML)") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise InputError(
-            f"{name}: cannot be read ({reason}); give the path of a simulation file (TOML)"
-        ) from None
+        raise InputError(f"{name}: cannot be read ({reason}); give the path of a simulation file (TOML)") from None
     if len(content) > LARGEST_FILE:
-        raise InputError(
-            f"{name}: is larger than {LARGEST_FILE:,} bytes; a simulation file is a short TOML text"
-        )
+        raise InputError(f"{name}: is larger than {LARGEST_FILE:,} bytes; a simulation file is a short TOML text")
     if not content.strip():
-        raise InputError(
-            f"{name}: is empty; a simulation file (TOML) needs at least [system] and [recording]"
-        )
+        raise InputError(f"{name}: is empty; a simulation file (TOML) needs at least [system] and [recording]")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
-        raise InputError(
-            f"{name}, line {line}: is not UTF-8 text; save the simulation file as UTF-8"
-        ) from None
+        raise InputError(f"{name}, line {line}: is not UTF-8 text; save the simulation file as UTF-8") from None
 
 
 def _parsed(text: str, name: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except RecursionError:
-        raise InputError(
-            f"{name}: is nested too deeply to be a simulation file; see the contract's example"
-        ) from None
+        raise InputError(f"{name}: is nested too deeply to be a simulation file; see the contract's example") from None
     except ValueError as error:
         if "digits" in str(error):
-            raise InputError(
-                f"{name}: holds a number of thousands of digits; write it as 1.5e10 is"
-            ) from None
+            raise InputError(f"{name}: holds a number of thousands of digits; write it as 1.5e10 is") from None
         reason = str(error).removesuffix(".").replace("\n", " ")[:200]
         raise InputError(f"{name}: is not TOML ({reason}); correct the place named") from None

@@ -45,9 +45,7 @@ class TermReader:
         if effect is None:
             raise InputError(f"{where} effect: missing; name one of the effects, such as `viscous_damping`")
         if not isinstance(effect, str) or effect not in VOCABULARY:
-            raise InputError(
-                f"{where} effect: unknown effect {shown(effect)}; {nearest(str(effect), VOCABULARY)}"
-            )
+            raise InputError(f"{where} effect: unknown effect {shown(effect)}; {nearest(str(effect), VOCABULARY)}")
         return VOCABULARY[effect]
 
     def check_keys(self, data: Mapping[str, Any], word: Word, where: str) -> None:
@@ -55,9 +53,7 @@ class TermReader:
         known = ["effect", *needed, *(["side"] if word.sides else []), "recordings"]
         for key in data:
             if key not in known:
-                raise InputError(
-                    f"{where} {shown(key)[1:-1]}: unknown key for {word.name}; {nearest(key, known)}"
-                )
+                raise InputError(f"{where} {shown(key)[1:-1]}: unknown key for {word.name}; {nearest(key, known)}")
         for key in needed:
             if key not in data:
                 raise InputError(f"{where} {key}: missing; {word.name} needs {', '.join(needed)}")
@@ -66,11 +62,7 @@ class TermReader:
         given, where = data["target"], f"{where} target"
         targets = [given] if isinstance(given, str) else given
         count = 2 if word.target == PAIR else 1
-        if (
-            not isinstance(targets, list)
-            or len(targets) != count
-            or not all(isinstance(t, str) for t in targets)
-        ):
+        if not isinstance(targets, list) or len(targets) != count or not all(isinstance(t, str) for t in targets):
             needed = 'two coordinates, ["q1", "q2"]' if count == 2 else f"one name, that of a {word.target}"
             raise InputError(f"{where}: {shown(given)} was given where {needed}, is needed")
         choices = self.choices[word.target]
@@ -92,9 +84,7 @@ class TermReader:
         if first == second:
             raise InputError(f"{where}: {shown(targets[0])} is named twice; name two different coordinates")
         if first > second and word.name == "gyroscopic_coupling":
-            raise InputError(
-                f"{where}: is not in the order of `coordinates`; swap the two names and the sign of b"
-            )
+            raise InputError(f"{where}: is not in the order of `coordinates`; swap the two names and the sign of b")
         targets.sort(key=self.table.system.coordinates.index)
 
     def coefficient(self, data: Mapping[str, Any], name: str, word: Word, where: str) -> Quantity:
@@ -133,7 +123,6 @@ def _recordings(data: Mapping[str, Any], where: str) -> tuple[int, ...] | None:
     is_list = isinstance(given, list) and len(given) > 0
     if not is_list or not all(type(n) is int and n >= 1 for n in given) or len(set(given)) != len(given):
         raise InputError(
-            f"{where} recordings: {shown(given)} was given where a list such as [1, 3], "
-            "counted from 1, is needed"
+            f"{where} recordings: {shown(given)} was given where a list such as [1, 3], counted from 1, is needed"
         )
     return tuple(given)

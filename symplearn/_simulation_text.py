@@ -99,8 +99,6 @@ def _text(text: str) -> str:
     """A basic TOML string; control characters are escaped."""
     return (
         '"'
-        + "".join(
-            _ESCAPES.get(c) or (c if ord(c) >= 32 and c != "\x7f" else f"\\u{ord(c):04x}") for c in text
-        )
+        + "".join(_ESCAPES.get(c) or (c if ord(c) >= 32 and c != "\x7f" else f"\\u{ord(c):04x}") for c in text)
         + '"'
     )

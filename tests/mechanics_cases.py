@@ -63,9 +63,7 @@ def _double_pendulum(m1, m2, l1, l2, g):
 
 
 CASES: dict[str, Case] = {
-    "oscillator": Case(
-        ig.problems.HarmonicOscillator(2.0, 3.0), lambda t, x: [x[1] / 2.0, -3.0 * x[0]], (1, -1), 2.0
-    ),
+    "oscillator": Case(ig.problems.HarmonicOscillator(2.0, 3.0), lambda t, x: [x[1] / 2.0, -3.0 * x[0]], (1, -1), 2.0),
     "pendulum": Case(
         ig.problems.Pendulum(0.7, 1.3, 9.81),
         lambda t, x: [x[1] / (0.7 * 1.3**2), -0.7 * 9.81 * 1.3 * np.sin(x[0])],

@@ -112,9 +112,7 @@ def document():
                 "recordings": [1],
                 "probability": 0.9423,
                 "log_bayes_factor": 219.7,
-                "coefficients": {
-                    "c": {"mean": 0.00090321, "sd": 0.0000213, "interval95": [0.00086, 0.00094]}
-                },
+                "coefficients": {"c": {"mean": 0.00090321, "sd": 0.0000213, "interval95": [0.00086, 0.00094]}},
                 "sentence": SENTENCE,
             }
         ],
@@ -201,8 +199,6 @@ def consistent():
     answer["fit"]["before"]["holdout_log_density"] = None
     answer["parameters"]["before"] = answer["parameters"]["after"]
     one = series()
-    one = dataclasses.replace(
-        one, before=one.after, force_before=one.force_after, boundary=float(one.times[-1])
-    )
+    one = dataclasses.replace(one, before=one.after, force_before=one.force_after, boundary=float(one.times[-1]))
     equations = ("d(p)/dt = -F*sin(theta)", "angle_deg = 180*theta/pi")
     return damped_pendulum(document=answer, series=(one,), equation_after=equations)

@@ -32,16 +32,12 @@ def swing(seed, gravity=9.0):
         lambda t, x: [x[1], -gravity * np.sin(x[0])], (0.0, 9.75), [1.0, 0.0],
         t_eval=TIMES, method="DOP853", rtol=1e-10, atol=1e-12,
     ).y.T  # fmt: skip
-    return SimpleNamespace(
-        times=TIMES, readings=path + SD * np.random.default_rng(seed).normal(size=path.shape)
-    )
+    return SimpleNamespace(times=TIMES, readings=path + SD * np.random.default_rng(seed).normal(size=path.shape))
 
 
 def pendulum(gravity=8.5):
     return StateSpaceModel(
-        dynamics=Propagator(
-            ig.problems.Pendulum(Frozen(1.0), Frozen(1.0), gravity), ig.Leapfrog(), substeps=10
-        ),
+        dynamics=Propagator(ig.problems.Pendulum(Frozen(1.0), Frozen(1.0), gravity), ig.Leapfrog(), substeps=10),
         observation=FullState(),
         process_noise=AdditiveGaussian(ScaledIdentity(1e-6, dim=2)),
         measurement_noise=AdditiveGaussian(ScaledIdentity(Positive(1e-2), dim=2)),
@@ -77,9 +73,7 @@ def linear_with_unknown_start(prior_variance):
     ys = cases.simulate(A, H, Q, R, start, P0, 10, rng)[1]
     system = A, H, Q, R, m0, P0
     known = Frozen(jnp.asarray(A)), Frozen(jnp.asarray(H)), Gaussian(Learnt(m0), jnp.asarray(P0))
-    model = eqx.tree_at(
-        lambda m: (m.dynamics.A, m.observation.matrix, m.initial), cases.as_model(*system), known
-    )
+    model = eqx.tree_at(lambda m: (m.dynamics.A, m.observation.matrix, m.initial), cases.as_model(*system), known)
     return system, model, TimeSeries(jnp.arange(10.0), jnp.asarray(ys))
 
 

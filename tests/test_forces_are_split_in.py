@@ -42,9 +42,7 @@ def test_without_forces_it_is_the_method_itself(name):
 @pytest.mark.parametrize("force", [ig.ViscousDamping(0.4), ig.QuadraticDrag(0.4), ig.CoulombFriction(0.1)])
 def test_dissipation_never_raises_the_energy(force):
     """Dissipative kicks lower the energy; the implicit midpoint flow keeps a quadratic one exactly."""
-    path = ig.integrate(
-        ig.Forced(OSCILLATOR, [force]), ig.ImplicitMidpoint(), START, np.linspace(0.0, 30.0, 601)
-    )
+    path = ig.integrate(ig.Forced(OSCILLATOR, [force]), ig.ImplicitMidpoint(), START, np.linspace(0.0, 30.0, 601))
     # Newton's round-off, a few 1e-16 of an energy of 1.5.
     assert np.diff(path.energies).max() < 1e-14
     assert path.energies[-1] < 0.2 * path.energies[0]
@@ -75,9 +73,7 @@ def test_coulomb_friction_takes_a_fixed_amount_off_each_swing(name):
 def test_a_body_held_by_friction_stays_off_its_equilibrium(name):
     """It sticks within f / k of the equilibrium and does not creep, however long one waits."""
     system = ig.Forced(ig.problems.HarmonicOscillator(), [ig.CoulombFriction(0.1)])
-    path = ig.integrate(
-        system, METHODS[name], jnp.array([1.03, 0.0]), np.linspace(0.0, 200.0, 201), substeps=50
-    )
+    path = ig.integrate(system, METHODS[name], jnp.array([1.03, 0.0]), np.linspace(0.0, 200.0, 201), substeps=50)
     resting = path.xs[30:]
     assert np.ptp(resting[:, 0]) == 0.0 and np.abs(resting[:, 1]).max() == 0.0
     assert resting[0, 0] == pytest.approx(-0.03, abs=5e-3)  # f dt times the number of turns

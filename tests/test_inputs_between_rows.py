@@ -94,9 +94,7 @@ def test_times_rounded_in_the_file_are_even():
     """Times written with three significant digits of a spacing are even; a skipped row is not."""
     even = np.round(66.6 + 1.63836e-3 * np.arange(5000), 6)
     Inputs(even, np.zeros((5000, 1)), "bandlimited")
-    with pytest.raises(
-        InputError, match='not evenly spaced near t = .*; give evenly spaced rows or inter.*"linear"'
-    ):
+    with pytest.raises(InputError, match='not evenly spaced near t = .*; give evenly spaced rows or inter.*"linear"'):
         Inputs(np.delete(even, 2500), np.zeros((4999, 1)), "bandlimited")
 
 
@@ -106,9 +104,7 @@ def test_outside_the_rows_by_more_than_half_a_spacing(interpolation):
     inputs = Inputs(np.arange(5.0), np.ones((5, 1)), interpolation, "swing.csv")
     np.testing.assert_allclose(inputs.at(np.array([-0.49, 4.49])), 1.0)
     for at in (-0.51, 4.51):
-        with pytest.raises(
-            InputError, match=f"swing.csv: inputs are needed at {at}, .*add rows with inputs and empty"
-        ):
+        with pytest.raises(InputError, match=f"swing.csv: inputs are needed at {at}, .*add rows with inputs and empty"):
             inputs.at(np.array([1.0, at]))
     with pytest.raises(InputError, match="needed at 9"):
         inputs.mean_over(np.array([1.0]), np.array([9.0]))

@@ -89,9 +89,7 @@ def test_what_learns_is_what_one_would_say():
 def test_resolving_gives_plain_arrays_and_stops_frozen_derivatives():
     """`resolve` replaces leaves by their values, once is enough, and nothing flows into a frozen number."""
     plain = resolve(model())
-    np.testing.assert_allclose(
-        plain.measurement_noise.covariance(), np.diag([1.0, 2.0, 3.0, 4.0]), rtol=1e-15
-    )
+    np.testing.assert_allclose(plain.measurement_noise.covariance(), np.diag([1.0, 2.0, 3.0, 4.0]), rtol=1e-15)
     assert eqx.tree_equal(plain, resolve(plain))
     held = jax.grad(lambda x: resolve(Frozen(x)) ** 2)(jnp.array(3.0))
     assert float(held) == 0.0

@@ -50,8 +50,7 @@ TIMES, READINGS = [0, 1, 2, 3, 4], [1, 2, np.nan, np.nan, -0.5]
         PLAIN.replace("t,a", '"t","a"').replace("1,2", '"1","2"'),
         PLAIN.replace(",", " , "),
         PLAIN.replace("2,\n", "\n  \n2,\n") + ",\n",
-        "b,t,c,a\n"
-        + "".join(f"x#,{row.split(',')[0]},NA,{row.split(',')[1]}\n" for row in PLAIN.split()[1:]),
+        "b,t,c,a\n" + "".join(f"x#,{row.split(',')[0]},NA,{row.split(',')[1]}\n" for row in PLAIN.split()[1:]),
         "b\u00e9,".encode("latin-1") + PLAIN.replace("\n", "\n,").rstrip(",").encode(),
     ],
     ids=["plain", "CRLF", "no end", "BOM", "comments", "quotes", "spaces", "blank", "others", "latin"],
@@ -137,9 +136,7 @@ def test_start_and_end_are_both_inside(tmp_path):
     rows = "t,a\n" + "".join(f"{i},{i * i}\n" for i in range(10))
     (recording,) = read(tmp_path, rows, "start = 2\nend = 6")
     np.testing.assert_array_equal(recording.times, [2, 3, 4, 5, 6])
-    found = read(
-        tmp_path, GROUPED, 'group = "run"\nwhere = { ball = "x" }\nstart = { "1" = 1 }\nend = { "2" = 1 }'
-    )
+    found = read(tmp_path, GROUPED, 'group = "run"\nwhere = { ball = "x" }\nstart = { "1" = 1 }\nend = { "2" = 1 }')
     np.testing.assert_array_equal(found[0].times, [0, 1])
     np.testing.assert_array_equal(found[1].times, [1, 2])
 

@@ -107,9 +107,7 @@ def test_every_section_is_read():
 
 def test_the_users_words_are_repeated():
     """The augmented file repeats every expression as the user wrote it."""
-    assert 'hamiltonian = "p**2/2 + r**2/(2*m)\\n  + k*x**2"' in simulation_text(
-        parse_simulation(FULL, "a.toml")
-    )
+    assert 'hamiltonian = "p**2/2 + r**2/(2*m)\\n  + k*x**2"' in simulation_text(parse_simulation(FULL, "a.toml"))
 
 
 def test_a_changed_record_is_written():

@@ -39,9 +39,7 @@ def test_everything_smoothed_is_the_joint_gaussian_conditioned(alpha, tolerance)
     for name in (
         "means", "covariances", "disturbances", "disturbance_covariances", "standardised_disturbances",
     ):  # fmt: skip
-        np.testing.assert_allclose(
-            getattr(found, name), getattr(expected, name), atol=tolerance, err_msg=name
-        )
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=tolerance, err_msg=name)
     seen = ~np.isnan(ys)
     assert np.array_equal(np.asarray(found.observed), seen)
     for name in ("residuals", "standardised_residuals"):
@@ -61,9 +59,7 @@ def test_without_process_noise_disturbances_are_scores():
     ys = recorded(system)
     found = smoothed(cases.as_model(*system), ys)
     # Slopes of a state that is known exactly come by steps of 1e-5, which keep ten digits.
-    np.testing.assert_allclose(
-        found.standardised_disturbances, cases.Conditioned(*system, ys).scores, atol=1e-8
-    )
+    np.testing.assert_allclose(found.standardised_disturbances, cases.Conditioned(*system, ys).scores, atol=1e-8)
     assert not np.any(np.asarray(found.disturbances))
 
 

@@ -129,9 +129,7 @@ def test_nonlinear_models_give_the_textbook_unscented_filter(alpha, tolerance):
         pendulum_step, lambda x: x[:1], 1e-4 * np.eye(2), 0.04 * np.eye(1), np.array([1.5, 0.0]),
         0.1 * np.eye(2), ys, alpha,
     )  # fmt: skip
-    assert float(SCORE(model, ys, SPANS, None, UnscentedTransform(alpha))) == pytest.approx(
-        expected, rel=tolerance
-    )
+    assert float(SCORE(model, ys, SPANS, None, UnscentedTransform(alpha))) == pytest.approx(expected, rel=tolerance)
 
 
 def scored(vector, ys):

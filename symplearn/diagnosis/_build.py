@@ -89,7 +89,8 @@ def build(
     restriction: Restriction,
 ) -> Problem:
     """Lay the recordings out and gather every prior."""
-    rows = tuple(lay_out(recordings, holdout, bin_width(recordings), substep))
+    # A prior of the initial state belongs to the first row, which must then stay.
+    rows = tuple(lay_out(recordings, holdout, bin_width(recordings), substep, shorten=not file.initial))
     known, calibrated = _terms(file, built, len(recordings))
     used = max(float(np.max(r.spans.step)) for r in rows)
     return Problem(

@@ -197,9 +197,7 @@ class _Answer:
                 "rows": sum(r.given for r in self.problem.rows),
                 "used": sum(r.used for r in self.problem.rows),
             },
-            "converged": bool(
-                self.after.converged and all(o.ok and np.isfinite(o.readings).all() for o in self.with_)
-            ),
+            "converged": bool(self.after.converged and all(o.ok and np.isfinite(o.readings).all() for o in self.with_)),
             "version": VERSION,
             "seed": self.options.seed,
             "seconds": round(seconds, 2),
@@ -298,8 +296,12 @@ class _Answer:
 
     def _warnings(self) -> list[str]:
         out, c = [], self.problem.calibrated
-        thinned = [r for r in self.problem.rows if r.used < r.given]
-        if thinned:
+        shortened = [r for r, whole in zip(self.problem.rows, self.recordings, strict=True)
+                     if r.times[0] > whole.times[0] and r.counts.max() <= 1]  # fmt: skip
+        for r in shortened:
+            out.append(f"only the last {r.fitted} rows before the held-out part were fitted, of {r.given} in all: "
+                       "they are too many, and too sparse for the motion to be averaged")  # fmt: skip
+        if any(r.counts.max() > 1 for r in self.problem.rows):
             given, used = sum(r.given for r in self.problem.rows), sum(r.used for r in self.problem.rows)
             out.append(f"the rows were averaged from {given} to {used}: "
                        "they are sampled far above the motion's frequencies")  # fmt: skip

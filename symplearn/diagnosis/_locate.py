@@ -89,11 +89,11 @@ def kind_and_targets(problem: Problem, combination: Combination) -> tuple[str, l
     return kind, list(dict.fromkeys(c.target for c in chosen))
 
 
-def whole_windows(outlooks: Sequence[Outlook]) -> list[list[float]]:
+def whole_windows(outlooks: Sequence[Outlook]) -> list[list[float | int]]:
     """The whole span of every recording, with its number where there are several."""
     spans = []
     for o in outlooks:
-        span: list[float] = [float(o.rows.times[0]), float(o.rows.times[-1])]
+        span: list[float | int] = [float(o.rows.times[0]), float(o.rows.times[-1])]
         spans.append(span + [o.recording + 1] if len(outlooks) > 1 else span)
     return spans
 

@@ -155,14 +155,12 @@ class Search:
 
     def _exchange(self, size: int) -> None:
         """Exchange single members of the best combinations of one size, so that no rival is missed."""
-        if size == 1 or not self._in_time():
+        if size == 1 or self._long or not self._in_time():
             return
         mine = sorted((c for c in self.found.estimates if len(c) == size), key=self.found.best, reverse=True)
-        if self._long and not self._gained(size):
-            return
         swapped = {
             tuple(sorted((*c[:k], *c[k + 1 :], one)))
-            for c in mine[: 1 if self._long else _KEPT // 2]
+            for c in mine[: _KEPT // 2]
             for k in range(size)
             for one in self.problem.searched
             if one not in c

@@ -57,15 +57,11 @@ def channel(diagnosis: Diagnosis, series: Series, column: str) -> Channel:
 def motion_panels(one: Channel, detail: bool) -> list[Panel]:
     """Overview and close-up; with `detail` the residuals too."""
     drawn = [panel(lambda axes: overview(axes, one), f"Readings and simulation: {one.column}")]
-    drawn.append(
-        panel(lambda axes: close_up(axes, one), f"From close, after the last fitted row: {one.column}")
-    )
+    drawn.append(panel(lambda axes: close_up(axes, one), f"From close, after the last fitted row: {one.column}"))
     if detail:
         drawn.append(panel(lambda axes: _residuals(axes, one), f"Reading minus simulation: {one.column}"))
     if detail and one.after is not None:
-        drawn.append(
-            panel(lambda axes: _remainder(axes, one), f"Reading minus simulation, after: {one.column}")
-        )
+        drawn.append(panel(lambda axes: _remainder(axes, one), f"Reading minus simulation, after: {one.column}"))
     return drawn
 
 

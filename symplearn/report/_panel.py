@@ -87,9 +87,7 @@ def with_unit(name: str, unit: str | None) -> str:
 def legend(axes: Axes, columns: int = 3) -> None:
     """The legend above the axes, where it hides nothing."""
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(
-            loc="lower left", bbox_to_anchor=(0, 1), ncols=columns, borderaxespad=0.2, handlelength=1.6
-        )
+        axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=columns, borderaxespad=0.2, handlelength=1.6)
 
 
 def first_look(changed: bool) -> dict[str, Any]:

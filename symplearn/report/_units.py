@@ -14,9 +14,7 @@ def coefficient_unit(finding: Mapping[str, Any], diagnosis: Diagnosis) -> str | 
         return units.get(target)
     if not isinstance(effect, Drag | PowerForce):
         return None
-    momentum = dict(zip(diagnosis.augmented.coordinates, diagnosis.augmented.momenta, strict=True)).get(
-        target, ""
-    )
+    momentum = dict(zip(diagnosis.augmented.coordinates, diagnosis.augmented.momenta, strict=True)).get(target, "")
     known = units.get(momentum), units.get(target), time_unit(diagnosis)
     # Force is p / t, and speed q / t.
     powers = (1, -effect.power, effect.power - 1) if isinstance(effect, Drag) else (1, -effect.power, -1)

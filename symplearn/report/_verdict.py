@@ -14,9 +14,7 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
     document = diagnosis.document
     chance = f"probability {probability(document['probability'])}"
     if document["verdict"] == "consistent" and document["probability"] < 0.5:
-        return (
-            f"The recording rules out neither the simulation as it is nor that it lacks something ({chance})."
-        )
+        return f"The recording rules out neither the simulation as it is nor that it lacks something ({chance})."
     if document["verdict"] == "consistent":
         return f"The simulation agrees with the recording; nothing needs to be added ({chance})."
     if document["verdict"] == "unexplained":
