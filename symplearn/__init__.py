@@ -1,6 +1,7 @@
 """Identify Hamiltonian systems from few, noisy, indirect recordings, and say what physics a simulation left out.
 
-In reading order: recordings and simulation files, models, objectives, fits, forecasts, diagnosis, report.
+In reading order: recordings and simulation files, models, objectives, fits, forecasts, diagnosis. What writes the
+report is in `symplearn.report`, which alone needs matplotlib.
 """
 
 from ._errors import InputError as InputError
@@ -57,4 +58,3 @@ from .diagnosis import Diagnosis as Diagnosis
 from .diagnosis import Options as Options
 from .diagnosis import diagnose as diagnose
 from .diagnosis import restriction_of as restriction_of
-from .report import write_outputs as write_outputs

@@ -73,7 +73,8 @@ class Search:
         self._add_paths(fit_paths(self.stepper, self.null_paths, self.found.priors, self.rows, 3))
         for size in range(1, SLOTS + 1):
             candidates = self._proposals(size)
-            if not candidates or not self._in_time():
+            # The simulation as it is and single effects are weighed however little time is given.
+            if not candidates or (size > 1 and not self._in_time()):
                 break
             single = f"the simulation as it is and {len(candidates) - 1} single effects"
             self.progress(f"weighing {single if size == 1 else f'{len(candidates)} combinations of {size} effects'}")
@@ -97,13 +98,10 @@ class Search:
     def _null_paths(self, priors: Priors) -> list[PathFit]:
         """The simulation without effects under missing forces of several intensities."""
         problem = self.problem
-        starts = []
         guess = self._rough_noise()
         first = [self._filtered_path(r, self.seed, guess) for r in range(len(self.rows))]
         self.typical = typical_forces(problem, self.seed, first)
-        for share in _SHARES:
-            start = PathFit((), self._intensity(share), self.seed, guess, first)
-            starts.append(start)
+        starts = [PathFit((), self._intensity(share), self.seed, guess, first) for share in _SHARES]
         return fit_paths(self.stepper, starts, priors, self.rows, self._path_steps)
 
     def _intensity(self, share: float) -> np.ndarray:

@@ -100,7 +100,8 @@ def finding_sentence(
 
 def next_measurement(problem: Problem, posterior: Posterior, chosen: Combination | None) -> str:
     """Which recording would tell the remaining alternatives apart."""
-    rivals = [w.combination for w in posterior.named if w.probability > 0.02][:6]
+    likeliest = max((w.probability for w in posterior.named), default=0.0)
+    rivals = [w.combination for w in posterior.named if w.probability > max(0.02, 0.1 * likeliest)][:6]
     if chosen is None and posterior.as_it_is > 0.05:
         if not rivals or posterior.as_it_is > 0.9:
             return "none is needed; a longer recording at another amplitude would test the simulation harder"
