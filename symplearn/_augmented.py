@@ -52,8 +52,12 @@ def equations(
     inputs: Sequence[sympy.Symbol],
     forces: Sequence[sympy.Expr],
     readings: dict[str, sympy.Expr],
+    drifts: dict[str, sympy.Expr],
 ) -> Equations:
-    """Build the augmented simulation from parsed expressions; `forces` has one entry per momentum."""
+    """Build the augmented simulation from parsed expressions.
+
+    `forces` has one entry per momentum. `drifts` are known errors of the columns that no gain multiplies.
+    """
     names = [str(q) for q in coordinates]
     candidates = vocabulary(names, list(readings))
     c = [sympy.Symbol(f"c{index}*", real=True) for index in range(len(candidates))]
@@ -64,7 +68,7 @@ def equations(
     )
     drags = tuple(tuple(i for i, one in enumerate(candidates) if one.effect is kind)
                   for kind in (VISCOUS, QUADRATIC, COULOMB))  # fmt: skip
-    shaped = [_read(h, j, candidates, c) for j, h in enumerate(readings.values())]
+    shaped = [_read(h, j, candidates, c) + drifts[column] for j, (column, h) in enumerate(readings.items())]
     moving = [bool(f.free_symbols & set(momenta)) for f in forces]
     still = [sympy.Integer(0) if m else f for f, m in zip(forces, moving, strict=True)]
     driven = [f if m else sympy.Integer(0) for f, m in zip(forces, moving, strict=True)]

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from .._effects import EFFECTS
 from .._simulation_records import Quantity, SimulationFile, Term
 from ._problem import Problem
 from ._weighed import Estimate
@@ -36,6 +37,9 @@ def _recalibrated_terms(file: SimulationFile, first: int, z: np.ndarray, sd: np.
     """Known terms as they are; calibrated ones, which follow the parameters in z, at their posterior."""
     terms, place = [], first
     for term in file.terms:
+        if term.effect not in EFFECTS:
+            terms.append(term)
+            continue
         ((name, quantity),) = term.coefficients.items()
         if not quantity.known:
             quantity = _recalibrated(quantity, float(z[place]), float(sd[place]))

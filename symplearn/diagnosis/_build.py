@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
-import sympy
 
 import integrators as ig
 
@@ -15,8 +14,9 @@ from .._errors import InputError, nearest, shown
 from .._expression import symbol
 from .._recording import Recording
 from .._rows import Rows, bin_width, lay_out
-from .._simulation_records import Quantity, SimulationFile, Term
+from .._simulation_records import Quantity, SimulationFile
 from .._symbolic import TooLarge
+from .._terms import mechanics, noise_factor
 from .._thinning import highest_frequency
 from ._problem import Calibrated, InitialPrior, Problem
 from ._stochastic import free_run
@@ -45,18 +45,22 @@ class Restriction:
         return named and (self.sensor if candidate.effect.family == "sensor" else self.dynamics)
 
 
-def augmented_equations(file: SimulationFile) -> Equations:
-    """The augmented simulation of a file. `InputError` where its Hamiltonian is too large to differentiate."""
-    zero = sympy.Integer(0)
+def augmented_equations(file: SimulationFile, start: float = 0.0) -> Equations:
+    """The augmented simulation of a file whose first row used is at time `start`.
+
+    `InputError` where its Hamiltonian is too large to differentiate.
+    """
     try:
+        known = mechanics(file, start)
         built = equations(
-            [symbol(q) for q in file.coordinates],
-            [symbol(p) for p in file.momenta],
-            file.hamiltonian.tree,
+            known.coordinates,
+            known.momenta,
+            known.hamiltonian,
             [symbol(name) for name in file.parameters],
             [symbol(name) for name in file.recording.inputs],
-            [file.forces[p].tree if p in file.forces else zero for p in file.momenta],
-            {column: h.tree for column, h in file.recording.observe.items()},
+            known.forces,
+            known.readings,
+            known.drifts,
         )
     except TooLarge:
         raise InputError(
@@ -101,7 +105,7 @@ def build(
         terms=known,
         calibrated=calibrated,
         initial=_initial(file),
-        noise=np.array([file.recording.noise.get(c, np.nan) for c in built.columns], float),
+        noise=np.array([file.recording.noise.get(c, np.nan) * noise_factor(file, c) for c in built.columns], float),
         searched=tuple(i for i, c in enumerate(built.candidates) if restriction.allows(c)),
         units=dict(file.units),
     )
@@ -138,8 +142,10 @@ def _terms(file: SimulationFile, built: Equations, recordings: int) -> tuple[np.
     known = np.zeros((recordings, len(built.candidates)))
     free = [(n, i, q, np.ones(recordings)) for i, (n, q) in enumerate(file.parameters.items()) if not q.known]
     parameters = len(free)
-    for number, term in enumerate(file.terms, start=1):
-        place = keys[_supported(file, term, number), term.target[0]]
+    for term in file.terms:
+        if term.effect not in EFFECTS:
+            continue  # written into the equations
+        place = keys[term.effect, term.target[0]]
         ((name, quantity),) = term.coefficients.items()
         mask = np.array([term.recordings is None or r + 1 in term.recordings for r in range(recordings)], float)
         if quantity.known:
@@ -157,15 +163,6 @@ def _terms(file: SimulationFile, built: Equations, recordings: int) -> tuple[np.
         upper=bounds[:, 1],
         recordings=np.stack([m for _, _, _, m in free], axis=1) if free else np.zeros((recordings, 0)),
     )
-
-
-def _supported(file: SimulationFile, term: Term, number: int) -> str:
-    if term.effect not in EFFECTS:
-        raise InputError(
-            f"{file.name}: [[terms]] {number}: {term.effect} cannot be simulated by this version; "
-            f"write it into the Hamiltonian or [forces], or use one of {', '.join(EFFECTS)}"
-        )
-    return term.effect
 
 
 def restriction_of(effects: str | None, sensor_only: bool, dynamics_only: bool) -> Restriction:

@@ -83,7 +83,7 @@ def _times_ahead(recording: Recording, options: Options) -> np.ndarray | None:
 
 def _ready(file: SimulationFile, recordings: Sequence[Recording], options: Options) -> tuple[Stepper, np.ndarray]:
     """The problem laid out with substeps that are fine enough, and initial states to start from."""
-    built, substep = augmented_equations(file), first_substep(file, recordings)
+    built, substep = augmented_equations(file, float(recordings[0].times[0])), first_substep(file, recordings)
 
     def rebuild(longest: float) -> Problem:
         return build(file, built, recordings, options.holdout, longest, options.restriction)
