@@ -1,7 +1,8 @@
 """The simulation with every word of the vocabulary built in, each behind a coefficient that may be zero."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import equinox as eqx
 import jax
@@ -52,7 +53,7 @@ def equations(
     inputs: Sequence[sympy.Symbol],
     forces: Sequence[sympy.Expr],
     readings: dict[str, sympy.Expr],
-    drifts: dict[str, sympy.Expr],
+    drifts: Mapping[str, sympy.Expr] = MappingProxyType({}),
 ) -> Equations:
     """Build the augmented simulation from parsed expressions.
 
@@ -68,7 +69,7 @@ def equations(
     )
     drags = tuple(tuple(i for i, one in enumerate(candidates) if one.effect is kind)
                   for kind in (VISCOUS, QUADRATIC, COULOMB))  # fmt: skip
-    shaped = [_read(h, j, candidates, c) + drifts[column] for j, (column, h) in enumerate(readings.items())]
+    shaped = [_read(h, j, candidates, c) + drifts.get(column, 0) for j, (column, h) in enumerate(readings.items())]
     moving = [bool(f.free_symbols & set(momenta)) for f in forces]
     still = [sympy.Integer(0) if m else f for f, m in zip(forces, moving, strict=True)]
     driven = [f if m else sympy.Integer(0) for f, m in zip(forces, moving, strict=True)]
