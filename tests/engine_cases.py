@@ -54,7 +54,7 @@ def problem(file: SimulationFile, recordings: Sequence[Recording], substep: floa
 
 
 def solved(rates: Callable, start: Sequence[float], times: np.ndarray, tolerance: float = 1e-10) -> np.ndarray:
-    """SciPy's DOP853 (time, state)."""
+    """SciPy's DOP853 (time, state), its tolerance far below what any test that uses it asks for."""
     span = (float(times[0]), float(times[-1]))
     found = solve_ivp(rates, span, start, "DOP853", times, rtol=tolerance, atol=tolerance * 1e-2)
     assert found.success, found.message

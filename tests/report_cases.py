@@ -42,7 +42,7 @@ def motion(times, start, damping):
         start,
         t_eval=times,
         method="DOP853",
-        rtol=1e-9,
+        rtol=1e-9,  # far below a picture's resolution
         atol=1e-11,
     )
     return flow.y

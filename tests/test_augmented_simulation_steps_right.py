@@ -99,6 +99,7 @@ def test_every_effect_enters_as_the_contract_says(built, method, rates, effect):
     value, force = EFFECTS[effect]
     expected = by_hand(rates(force))
     found = moved(built, method, coefficients(built, **{effect: value}))
+    # By order: see `tolerance`.
     np.testing.assert_allclose(found, expected, atol=tolerance(effect))
     # And the effect is seen: without it the motion ends elsewhere.
     assert np.abs(by_hand(rates(lambda q, v: 0.0)) - expected).max() > 1e-2

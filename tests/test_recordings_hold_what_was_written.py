@@ -1,11 +1,10 @@
 """A recording holds the rows of the file: the right ones, in order, with missing readings as NaN."""
 
 import gzip
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
+from real_recordings import real_case
 
 from symplearn._errors import InputError
 from symplearn._recording import read_recordings
@@ -194,9 +193,6 @@ def test_one_constant_column_beside_one_that_moves(tmp_path):
     assert recording.readings.shape == (3, 2)
 
 
-RECORDINGS = Path(os.environ.get("SYMPLEARN_RECORDINGS", Path(__file__).parents[2] / "shared" / "recordings"))
-
-
 @pytest.mark.recordings
 @pytest.mark.parametrize(
     ("folder", "file", "rows", "first", "last"),
@@ -208,11 +204,8 @@ RECORDINGS = Path(os.environ.get("SYMPLEARN_RECORDINGS", Path(__file__).parents[
 )
 def test_real_recordings(folder, file, rows, first, last):
     """Real recordings are read whole, with the window of the simulation beside them."""
-    if not RECORDINGS.is_dir():
-        pytest.skip(f"the real recordings are not at {RECORDINGS}; set SYMPLEARN_RECORDINGS")
-    (recording,) = read_recordings(
-        read_simulation(RECORDINGS / folder / "simulation.toml"), [RECORDINGS / folder / file]
-    )
+    simulation_path, path = real_case(folder, file)
+    (recording,) = read_recordings(read_simulation(simulation_path), [path])
     assert len(recording.times) == rows
     # 1e-3: the window's ends lie on rows a millisecond or two apart.
     np.testing.assert_allclose(recording.times[[0, -1]], [first, last], atol=1e-3)
