@@ -1,5 +1,6 @@
 """State-space models: dynamics, observation, noises and the initial state. Dissertation (2.1), (2.5)."""
 
+import abc
 from collections.abc import Callable
 from typing import Any
 
@@ -24,10 +25,14 @@ class Gaussian(AbstractKnown):
 
 
 class Interval(eqx.Module):
-    """The data interval between two readings: its `start` and its `end`, in the recording's time unit."""
+    """The data interval between two readings: its `start` and its `end`, in the recording's time unit.
+
+    `input` (input,) is u_k, known and held from `start` on; None where nothing drives the model.
+    """
 
     start: Float[Array, "..."]
     end: Float[Array, "..."]
+    input: Float[Array, "... input"] | None = None
 
     @property
     def length(self) -> Float[Array, "..."]:
@@ -35,10 +40,58 @@ class Interval(eqx.Module):
         return self.end - self.start
 
 
-def intervals_between(times: Float[Array, " time"]) -> Interval:
-    """The data intervals of n times, one record with leading axis n - 1."""
+class Instant(eqx.Module):
+    """The moment of a reading: its `time`, and the known `input` (input,) then, or None."""
+
+    time: Float[Array, "..."]
+    input: Float[Array, "... input"] | None = None
+
+
+def intervals_between(times: Float[Array, " time"], inputs: Float[Array, "time input"] | None = None) -> Interval:
+    """The data intervals of n times, one record with leading axis n - 1; u_k is held from time k on."""
     times = jnp.asarray(times)
-    return Interval(times[:-1], times[1:])
+    return Interval(times[:-1], times[1:], None if inputs is None else inputs[:-1])
+
+
+class AbstractAffine(eqx.Module):
+    """A map that is affine in the state, x -> slope x + (terms in the input).
+
+    Filters treat it exactly, whatever their transform.
+    """
+
+    @abc.abstractmethod
+    def slope(self, x: Float[Array, " state"]) -> Float[Array, "output state"]:
+        """The matrix that multiplies the state; `x` gives the state's size only."""
+
+    @abc.abstractmethod
+    def __call__(self, x: Float[Array, " state"], context: Any = None) -> Float[Array, " output"]:
+        """The map itself."""
+
+
+class LinearDynamics(AbstractAffine):
+    """x' = A x + B u, the dynamics of (3.1): A (state, state), B (state, input) or None. One step per data interval.
+
+    **Raises:** `ValueError` where B is given and the recording has no inputs.
+    """
+
+    A: Any
+    B: Any = None
+
+    def slope(self, x: Float[Array, " state"]) -> Float[Array, "state state"]:
+        return jnp.asarray(self.A)
+
+    def __call__(self, x: Float[Array, " state"], interval: Any = None) -> Float[Array, " state"]:
+        return self.A @ x + _driven(self.B, interval, x.shape[0], "LinearDynamics")
+
+
+def _driven(matrix: Any, context: Any, size: int, owner: str) -> Array:
+    """The matrix times the context's input; 0 without a matrix."""
+    if matrix is None:
+        return jnp.zeros(size)
+    given = getattr(context, "input", None)
+    if given is None:
+        raise ValueError(f"`{owner}` has an input matrix, but the recording has no inputs; give `TimeSeries` its `inputs`.")
+    return matrix @ given
 
 
 class Propagator(eqx.Module):
@@ -65,29 +118,43 @@ class Propagator(eqx.Module):
         return ig.propagate(self.system, self.integrator, x, interval.start, interval.end, self.substeps)
 
 
-class FullState(eqx.Module):
+class FullState(AbstractAffine):
     """The whole state is read: h(x) = x."""
+
+    def slope(self, x: Float[Array, " state"]) -> Float[Array, "state state"]:
+        return jnp.eye(x.shape[0])
 
     def __call__(self, x: Float[Array, " state"], context: Any = None) -> Float[Array, " state"]:
         return x
 
 
-class Coordinates(eqx.Module):
+class Coordinates(AbstractAffine):
     """Some entries of the state are read: h(x) = x[indices]; `Coordinates((0,))` reads q_0 of [q, p]."""
 
     indices: tuple[int, ...] = eqx.field(static=True)
+
+    def slope(self, x: Float[Array, " state"]) -> Float[Array, "channel state"]:
+        return jnp.eye(x.shape[0])[jnp.asarray(self.indices)]
 
     def __call__(self, x: Float[Array, " state"], context: Any = None) -> Float[Array, " channel"]:
         return x[jnp.asarray(self.indices)]
 
 
-class LinearObservation(eqx.Module):
-    """A linear reading of the state: h(x) = matrix @ x, matrix of shape (channel, state)."""
+class LinearObservation(AbstractAffine):
+    """A linear reading: h(x, u) = matrix x + feedthrough u, the H (channel, state) and D (channel, input) of (3.1).
+
+    **Raises:** `ValueError` where a feedthrough is given and the recording has no inputs.
+    """
 
     matrix: Any
+    feedthrough: Any = None
+
+    def slope(self, x: Float[Array, " state"]) -> Float[Array, "channel state"]:
+        return jnp.asarray(self.matrix)
 
     def __call__(self, x: Float[Array, " state"], context: Any = None) -> Float[Array, " channel"]:
-        return self.matrix @ x
+        reading = self.matrix @ x
+        return reading + _driven(self.feedthrough, context, reading.shape[0], "LinearObservation")
 
 
 class StateSpaceModel(eqx.Module):

@@ -23,6 +23,7 @@ class TimeSeries(eqx.Module):
 
     times: Float[Array, " time"]
     readings: Float[Array, "time channel"]
+    inputs: Float[Array, "time input"] | None = None
 
 
 def as_time_series(recording: Any) -> TimeSeries:
