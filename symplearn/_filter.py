@@ -1,86 +1,24 @@
-"""The unscented Kalman filter for additive noise. Dissertation (2.5)-(2.8), Algorithms 2 and 5 corrected.
+"""Kalman and unscented filters in square-root form. Dissertation (2.5)-(2.8), Algorithms 2, 4 and 5 corrected.
 
 Slips of the printed algorithms that are right here: the measurement at k = 0 is used first; sigma points go
 along the columns of a lower Cholesky factor and are drawn again before the measurement; the exponent is a
-squared norm.
+squared norm. The filter carries a square root of the state's covariance, which no round-off can make indefinite.
 """
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ._model import StateSpaceModel, slice_at
-
-# A pivot below this share of its diagonal entry is round-off of a singular covariance: its column is dropped.
-_SINGULAR = 1e-14
-# Loops over the columns of a small matrix are laid out flat up to this size, which XLA fuses better.
-_FLAT = 16
-
-
-class UnscentedTransform(eqx.Module):
-    """The scaled unscented transform with 2d + 1 sigma points. Wan and van der Merwe (2000); Algorithm 5.
-
-    The default is well conditioned. The dissertation uses (1e-3, 2, 0), whose weights of about 1e6 cost some
-    six digits. The moments are summed over differences from the centre point, and beta >= alpha**2 keeps
-    every covariance positive semi-definite.
-
-    **Raises:** `ValueError` where alpha <= 0 or beta < alpha**2.
-    """
-
-    alpha: float = eqx.field(static=True, default=1.0)
-    beta: float = eqx.field(static=True, default=2.0)
-    kappa: float = eqx.field(static=True, default=0.0)
-
-    def __check_init__(self):
-        if self.alpha <= 0 or self.beta < self.alpha**2:
-            raise ValueError(
-                f"`UnscentedTransform` needs alpha > 0 and beta >= alpha**2, but was given "
-                f"alpha={self.alpha}, beta={self.beta}. Use the default (1, 2, 0) or (1e-3, 2, 0)."
-            )
-
-    def spread(self, dim: int) -> float:
-        """d + lambda = alpha^2 (d + kappa), the squared stretch of the sigma points."""
-        if dim + self.kappa <= 0:
-            raise ValueError(f"`UnscentedTransform` needs dim + kappa > 0, but dim={dim}, kappa={self.kappa}.")
-        return self.alpha**2 * (dim + self.kappa)
-
-    def offsets(self, covariance: Float[Array, "state state"]) -> Float[Array, "point state"]:
-        """The sigma points other than the centre, minus it: +-sqrt(d + lambda) times the columns of L."""
-        half = math.sqrt(self.spread(covariance.shape[0])) * semidefinite_cholesky(covariance).T
-        return jnp.concatenate([half, -half])
-
-    def moments(self, function: Callable[[Any], Any], mean: Any, offsets: Any) -> "TransformedMoments":
-        """Moments of `function(x)` for the sigma points `mean` and `mean + offsets`."""
-        outputs = jax.vmap(function)(jnp.concatenate([mean[None], mean + offsets]))
-        deviations = outputs[1:] - outputs[0]
-        weight = 0.5 / self.spread(mean.shape[0])
-        shift = weight * jnp.sum(deviations, axis=0)
-        # sum_i w_i (D_i - shift)(D_i - shift)' with sum_i w_i = 2 + beta - alpha^2 and a zero centre
-        # difference.
-        remainder = (self.beta - self.alpha**2) * jnp.outer(shift, shift)
-        return TransformedMoments(outputs[0] + shift, deviations, remainder, weight)
-
-
-STANDARD = UnscentedTransform()
-
-
-class TransformedMoments(NamedTuple):
-    """What a transform knows of f(x): its mean, deviations from the centre (point, output), and the rest."""
-
-    mean: Array
-    deviations: Array
-    remainder: Array
-    weight: float
-
-    @property
-    def covariance(self) -> Array:
-        """Var[f(x)]."""
-        return self.weight * self.deviations.T @ self.deviations + self.remainder
+from ._errors import InputError
+from ._faults import IMPOSSIBLE, SENTENCES, Fault, first_fault, is_fatal, is_remote
+from ._guard import guard
+from ._model import AbstractAffine, AbstractStateSpaceModel, StateSpaceModel, slice_at
+from ._transforms import STANDARD, AbstractTransform, Moments, Taylor
+from ._triangular import forward_substitution, triangularise
 
 
 class Filtered(eqx.Module):
@@ -89,9 +27,9 @@ class Filtered(eqx.Module):
     `predicted_*` are given the readings before, `filtered_*` given the reading too; the first prediction is
     the initial distribution. `increments` (time,) add up to `log_likelihood`, in nats, constants included.
     `innovations` are y - E[y | past] and `standardised_innovations` the same divided by the lower Cholesky
-    factor of `innovation_covariances`; both are 0 where `observed` is False. `ok` is False where a step was
-    not finite or an innovation covariance not positive; `log_likelihood` is then -inf and the later moments
-    mean nothing.
+    factor of `innovation_covariances`; both are 0 where `observed` is False. `fault` and `fault_step` are the first
+    `Fault` met and the reading it was met at (-1 for none); `str(filtered)` says it in words. After a fatal one
+    `log_likelihood` is -1e15 and the later moments mean nothing.
     """
 
     log_likelihood: Float[Array, ""]
@@ -104,14 +42,28 @@ class Filtered(eqx.Module):
     innovation_covariances: Float[Array, "time channel channel"]
     standardised_innovations: Float[Array, "time channel"]
     observed: Bool[Array, "time channel"]
-    ok: Bool[Array, ""]
+    fault: Int[Array, ""]
+    fault_step: Int[Array, ""]
+
+    @property
+    def ok(self) -> Bool[Array, ""]:
+        """Whether the filter came through: no fault, or only a remote reading."""
+        return ~is_fatal(self.fault)
+
+    def __str__(self) -> str:
+        count = f"Filtered {self.increments.shape[0]} readings: log likelihood {float(self.log_likelihood):.6g} nats"
+        if int(self.fault) == Fault.NONE:
+            return count
+        verdict = "FAILED" if not bool(self.ok) else "note"
+        return f"{count}. {verdict} at reading {int(self.fault_step)}: {SENTENCES[Fault(int(self.fault))]}"
 
 
 class _Carry(NamedTuple):
     mean: Array
-    covariance: Array
+    root: Array
     log_likelihood: Array
-    ok: Array
+    fault: Array
+    fault_step: Array
 
 
 class _Record(NamedTuple):
@@ -127,145 +79,132 @@ class _Record(NamedTuple):
 
 
 def unscented_filter(
-    model: StateSpaceModel,
+    model: AbstractStateSpaceModel,
     readings: Float[Array, "time channel"],
     intervals: PyTree,
     contexts: PyTree = None,
-    transform: UnscentedTransform = STANDARD,
+    transform: AbstractTransform = STANDARD,
 ) -> Filtered:
     """Filter a recording and keep everything the smoother and a diagnosis need. Algorithm 2, corrected.
 
     **Arguments:** `model` - with plain arrays (see `resolve`) and an `initial` Gaussian; `readings` - NaN
     where missing, in whole rows or in part; `intervals` - a pytree with leading axis time - 1, one slice per
     data interval; `contexts` - a pytree with leading axis time for the observation, or None; `transform` -
-    sigma points.
+    the rule for the moments of what is not affine: `UnscentedTransform`, `Cubature`, `GaussHermite` or `Taylor`.
 
-    Works under `jit`, `vmap`, `jacfwd` and `grad`. After a failure forward gradients are 0; reverse
-    gradients are 0 too, unless the dynamics itself overflowed, where they may be NaN: look at `ok`.
+    Works under `jit`, `vmap`, `jacfwd` and `grad`. A failure is a value: see `Filtered.fault`; derivatives are then 0.
     """
     carry, first, later = _run(model, readings, intervals, contexts, transform, keep=True)
     history = [jnp.concatenate([one[None], rest]) for one, rest in zip(first, later, strict=True)]
-    # The fields of `_Record` are those of `Filtered` between the first and the last.
-    return Filtered(*(_guarded(carry), *history, carry.ok))
+    # The fields of `_Record` are those of `Filtered` between the first and the faults.
+    return Filtered(*(carry.log_likelihood, *history, carry.fault, carry.fault_step))
 
 
 def log_likelihood(
-    model: StateSpaceModel,
+    model: AbstractStateSpaceModel,
     readings: Float[Array, "time channel"],
     intervals: PyTree,
     contexts: PyTree = None,
-    transform: UnscentedTransform = STANDARD,
+    transform: AbstractTransform = STANDARD,
 ) -> Float[Array, ""]:
-    """The log marginal likelihood (2.4) in nats, without a history; -inf where the filter failed.
+    """The log marginal likelihood (2.4) in nats, without a history; -1e15 where the filter failed.
 
     Arguments as for `unscented_filter`.
     """
-    return _guarded(_run(model, readings, intervals, contexts, transform, keep=False)[0])
+    return _run(model, readings, intervals, contexts, transform, keep=False)[0].log_likelihood
 
 
-def _guarded(carry: _Carry) -> Array:
-    return jnp.where(carry.ok, carry.log_likelihood, -jnp.inf)
+def kalman_filter(
+    model: StateSpaceModel, readings: Float[Array, "time channel"], intervals: PyTree, contexts: PyTree = None
+) -> Filtered:
+    """The Kalman filter, exact for a model whose dynamics and observation are affine (3.1). Algorithm 4, corrected.
+
+    Arguments as for `unscented_filter`, which gives the same for such a model.
+
+    **Raises:** `InputError` where the dynamics or the observation is not an `AbstractAffine`.
+    """
+    for name, part in (("dynamics", model.dynamics), ("observation", model.observation)):
+        if not isinstance(part, AbstractAffine):
+            raise InputError(
+                f"`kalman_filter` is for affine models, but the {name} is `{type(part).__name__}`; use "
+                "`unscented_filter`, or make it a subclass of `AbstractAffine`."
+            )
+    return unscented_filter(model, readings, intervals, contexts, Taylor())
 
 
 def _run(model, readings, intervals, contexts, transform, keep):
     """Measure at k = 0, then predict and measure through every data interval."""
-    start = jnp.asarray(model.initial.mean)
-    zero = jnp.zeros((), start.dtype)
-    carry = _Carry(start, jnp.asarray(model.initial.covariance), zero, jnp.asarray(True))
-    carry, first = _measure(model, transform, carry, readings[0], slice_at(contexts, 0))
+    model = guard(model)
+    mean, root = jnp.asarray(model.initial.mean), model.initial.root
+    none = jnp.asarray(int(Fault.NONE))
+    start = _Carry(mean, root, jnp.zeros((), mean.dtype), none, jnp.asarray(-1))
+    predicted = Moments(mean, root, jnp.zeros((mean.shape[0], 0)))
+    carry, first = _measure(model, transform, start, predicted, readings[0], slice_at(contexts, 0), 0)
 
     def step(carry, data):
-        reading, interval, context = data
-        carry = _predict(model, transform, carry, interval)
-        carry, record = _measure(model, transform, carry, reading, context)
+        reading, interval, context, k = data
+        inside, carry = guard((model, carry))
+        predicted = inside.predict(transform, carry.mean, carry.root, interval)
+        carry, record = _measure(inside, transform, carry, predicted, reading, context, k)
         return carry, (record if keep else None)
 
     later_contexts = jax.tree.map(lambda leaf: leaf[1:], contexts)
     # Checkpointing the step makes the gradient faster as well as 16 times smaller (performance.md, A7).
     step = jax.checkpoint(step, prevent_cse=False)
-    carry, later = jax.lax.scan(step, carry, (readings[1:], intervals, later_contexts))
+    counts = jnp.arange(1, readings.shape[0])
+    carry, later = jax.lax.scan(step, carry, (readings[1:], intervals, later_contexts, counts))
     return carry, first, later
 
 
-def _predict(model, transform, carry, interval):
-    """Moments of the next state (2.6), sigma points drawn afresh from the filtered moments."""
-    offsets = transform.offsets(carry.covariance)
-    moments = transform.moments(lambda x: model.dynamics(x, interval), carry.mean, offsets)
-    covariance = moments.covariance + model.process_noise.covariance(interval)
-    # The transform's part is a sum of squares, so only a negative process noise can fail here.
-    positive = jnp.all(jnp.diagonal(covariance) >= 0.0)
-    return _accept(model, carry, moments.mean, covariance, positive, 0.0)
+def _measure(model, transform, carry, predicted, reading, context, k):
+    """Condition the prediction on one reading, (2.7)-(2.8), by one triangularisation of the joint square root.
 
-
-def _measure(model, transform, carry, reading, context):
-    """Condition on one reading, (2.7)-(2.8), with the covariance in Joseph's form, a sum of squares.
-
-    Missing channels get a unit innovation variance, no correlation and a zero innovation: exactly as if
-    absent.
+    [F_y; F_x] -> [S^1/2, 0; G, P+^1/2] with m+ = m + G e and e = S^-1/2 r. A missing channel has a row of zeros, which
+    leaves everything else as if it were absent.
     """
-    m, P = carry.mean, carry.covariance
-    offsets = transform.offsets(P)
-    moments = transform.moments(lambda x: model.observation(x, context), m, offsets)
-    noise = moments.remainder + model.measurement_noise.covariance()
+    m, factor, _ = predicted
+    # An exact reading takes the prediction's wide factor as it is and spares a triangularisation.
+    root = factor if model.reads_exactly else triangularise(factor)[0]
+    mean, rows, source = model.read(transform, m, root, context)
     seen = ~jnp.isnan(reading)
-    deviations = jnp.where(seen, moments.deviations, 0.0)
-    r = jnp.where(seen, jnp.where(seen, reading, 0.0) - moments.mean, 0.0)
-    S = moments.weight * moments.deviations.T @ moments.deviations + noise
-    masked = jnp.where(seen[:, None] & seen[None, :], S, 0.0) + jnp.diag(jnp.where(seen, 0.0, 1.0))
-    U = moments.weight * offsets.T @ deviations
-    whitened, roots, positive = _whiten(masked, jnp.concatenate([U, r[None], jnp.eye(r.shape[0])]))
-    UL, e, L_inverse = whitened[: m.shape[0]], whitened[m.shape[0]], whitened[m.shape[0] + 1 :].T
-    K = UL @ L_inverse
-    left = offsets - deviations @ K.T
-    mean = m + UL @ e
-    covariance = moments.weight * left.T @ left + K @ noise @ K.T
-    constant = 0.5 * math.log(2 * math.pi) * jnp.sum(seen)
-    increment = -0.5 * e @ e - jnp.sum(jnp.log(roots)) - constant
-    after = _accept(model, carry, mean, covariance, positive, increment)
-    safe_increment = after.log_likelihood - carry.log_likelihood
-    record = _Record(safe_increment, m, P, after.mean, after.covariance, r, S, e, seen)
-    return after, record
+    channels = reading.shape[0]
+    masked = jnp.where(seen[:, None], rows, 0.0)
+    triangle, good = triangularise(jnp.concatenate([masked, source]))
+    S_root, G = triangle[:channels, :channels], triangle[channels:, :channels]
+    r = jnp.where(seen, jnp.where(seen, reading, 0.0) - mean, 0.0)
+    e = forward_substitution(S_root, r)
+    pivots = jnp.where(seen & good[:channels], jnp.diagonal(S_root), 1.0)
+    increment = -0.5 * e @ e - jnp.sum(jnp.log(pivots)) - 0.5 * math.log(2 * math.pi) * jnp.sum(seen)
+    fault = first_fault(
+        (jnp.all(jnp.isfinite(m)), Fault.STATE),
+        (jnp.all(jnp.isfinite(factor)), Fault.COVARIANCE),
+        (jnp.all(jnp.isfinite(jnp.where(seen, mean, 0.0))) & jnp.all(jnp.isfinite(masked)), Fault.READING),
+        (jnp.all(good[:channels] | ~seen), Fault.SINGULAR),
+        (carry.log_likelihood + increment > IMPOSSIBLE, Fault.UNREACHED),
+        (~is_remote(e), Fault.REMOTE),
+    )
+    after = _accept(model, carry, m + G @ e, triangle[channels:, channels:], increment, fault, k)
+    if_ok = after.log_likelihood - carry.log_likelihood
+    moments = after.mean, after.root @ after.root.T
+    record = _Record(if_ok, m, factor @ factor.T, *moments, r, rows @ rows.T, e, seen)
+    return after, jax.tree.map(_tidy, record)
 
 
-def _accept(model, carry, mean, covariance, positive, increment):
-    """The next carry, or a harmless fixed one from the first failure on: no NaN is computed with."""
-    finite = jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(covariance)) & jnp.isfinite(increment)
-    ok = carry.ok & positive & finite
-    refuge = jax.lax.stop_gradient(jnp.asarray(model.initial.mean))
-    covariance = 0.5 * (covariance + covariance.T)
-    total = carry.log_likelihood + jnp.where(ok, increment, 0.0)
-    return _Carry(jnp.where(ok, mean, refuge), jnp.where(ok, covariance, 0.0), total, ok)
+def _tidy(leaf: Array) -> Array:
+    """Zero for what is not finite, which only a failed step leaves behind."""
+    return jnp.where(jnp.isfinite(leaf), leaf, jnp.zeros_like(leaf))
 
 
-def semidefinite_cholesky(covariance: Float[Array, "state state"]) -> Float[Array, "state state"]:
-    """Lower Cholesky factor of a covariance that may be singular, or zero; differentiable.
-
-    A column whose pivot is below 1e-14 of its diagonal entry is set to zero, together with its derivative.
-    """
-    return _eliminate(covariance, _SINGULAR)[0]
-
-
-def _whiten(covariance, rows):
-    """`rows` times the inverse transpose of the Cholesky factor L, the diagonal of L, and whether L
-    exists."""
-    columns, roots, positive = _eliminate(jnp.concatenate([covariance, rows]), 0.0)
-    return columns[covariance.shape[0] :], roots, jnp.all(positive)
-
-
-def _eliminate(stack, tolerance):
-    """Right-looking Cholesky of A on the stack [A; B]: gives [L; B L^-T], the diagonal of L, the good
-    pivots."""
-    height, size = stack.shape
-    rows = jnp.arange(height)
-
-    def column(rest, data):
-        j, scale = data
-        pivot = rest[j, j]
-        good = pivot > tolerance * jnp.abs(scale)
-        root = jnp.sqrt(jnp.where(good, pivot, 1.0))
-        entries = jnp.where(good & (rows >= j), rest[:, j] / root, 0.0)
-        return rest - jnp.outer(entries, entries[:size]), (entries, root, good)
-
-    data = (jnp.arange(size), jnp.diagonal(stack))
-    _, (columns, roots, good) = jax.lax.scan(column, stack, data, unroll=min(size, _FLAT))
-    return columns.T, roots, good
+def _accept(model, carry, mean, root, increment, fault, k):
+    """The next carry, or a harmless fixed one from the first fatal fault on: no NaN is computed with."""
+    failed = is_fatal(carry.fault) | is_fatal(fault)
+    first = (carry.fault == Fault.NONE) | (~is_fatal(carry.fault) & is_fatal(fault))
+    noted = (fault != Fault.NONE) & first
+    refuge = jax.lax.stop_gradient(jnp.nan_to_num(jnp.asarray(model.initial.mean)))
+    return _Carry(
+        jnp.where(failed, refuge, mean),
+        jnp.where(failed, 0.0, root),
+        jnp.where(failed, IMPOSSIBLE, carry.log_likelihood + increment),
+        jnp.where(noted, fault, carry.fault),
+        jnp.where(noted, k, carry.fault_step),
+    )

@@ -10,13 +10,14 @@ import optimistix as ox
 from jaxtyping import Array, Float
 
 from ._errors import InputError
-from ._model import StateSpaceModel
-from ._objectives import MARGINAL_LIKELIHOOD, AbstractObjective, TimeSeries, as_time_series
+from ._faults import IMPOSSIBLE
+from ._model import AbstractStateSpaceModel
+from ._objectives import MARGINAL_LIKELIHOOD, AbstractObjective, TimeSeries, as_recordings
 from ._parameters import flatten, named_parameters, value_of
 from ._prior import AbstractDensity, Prior
 
 # Stands for an infinite score inside the optimiser, which can compare it but must not subtract infinities.
-_HOPELESS = 1e12
+_HOPELESS = -IMPOSSIBLE
 # Up to this many parameters forward derivatives are the faster ones (performance.md).
 _FORWARD = 12
 _RESTARTS = 4
@@ -32,8 +33,8 @@ class Estimate(eqx.Module):
     one met.
     """
 
-    model: StateSpaceModel
-    recording: TimeSeries
+    model: AbstractStateSpaceModel
+    recording: TimeSeries | tuple[TimeSeries, ...]
     objective: AbstractObjective
     prior: Prior
     log_posterior: float
@@ -55,7 +56,7 @@ class Estimate(eqx.Module):
 
 
 def fit(
-    model: StateSpaceModel,
+    model: AbstractStateSpaceModel,
     recording: Any,
     objective: AbstractObjective = MARGINAL_LIKELIHOOD,
     *,
@@ -65,18 +66,20 @@ def fit(
 ) -> Estimate:
     """The maximum a posteriori model, by BFGS in free coordinates from the model as given.
 
-    **Arguments:** `recording` - times and readings; `prior` - a `Prior`, or one density such as `Flat()` for
-    every leaf; `tolerance` - nats that a quadratic model may still promise at the end; `max_steps` - of one
-    BFGS run; it is started afresh up to four times.
+    **Arguments:** `recording` - times and readings, or a list of such recordings; `prior` - a `Prior`, or one
+    density such as `Flat()` for every leaf; `tolerance` - nats that a quadratic model may still promise at the
+    end; `max_steps` - of one BFGS run; it is started afresh up to four times.
 
     **Raises:** `InputError` where nothing learns, a leaf has no prior, or the start has no finite score.
     """
     prior = prior if isinstance(prior, Prior) else Prior(prior)
-    series = as_time_series(recording)
+    recordings = as_recordings(recording)
+    series = recordings if isinstance(recording, list | tuple) else recordings[0]
     if not named_parameters(model):
         raise InputError("Nothing in the model learns: every number is known or `Frozen`. Wrap one in `Positive`.")
     posterior, likelihood, slope = _at(model, series, objective, prior)
-    if not bool(jnp.isfinite(posterior)):
+    # Another recording's nats may be added to the impossible one's.
+    if not bool(jnp.isfinite(posterior)) or float(likelihood) <= 0.5 * IMPOSSIBLE:
         raise InputError(
             f"The model has no finite score at its start: log likelihood {float(likelihood):.3g} and log "
             f"posterior {float(posterior):.3g} nats; start from smaller coefficients or larger noises."
@@ -106,7 +109,10 @@ def fit(
 
 
 def negative_log_posterior(
-    model: StateSpaceModel, series: TimeSeries, objective: AbstractObjective, prior: Prior
+    model: AbstractStateSpaceModel,
+    series: TimeSeries | tuple[TimeSeries, ...],
+    objective: AbstractObjective,
+    prior: Prior,
 ) -> Float[Array, ""]:
     """The score of the model plus minus the log prior density of its free coordinates, in nats."""
     return objective(model, series) - prior.log_density(model)

@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._errors import InputError
-from ._filter import UnscentedTransform
 from ._fit import Estimate
 from ._model import StateSpaceModel, intervals_between
 from ._objectives import MarginalLikelihood
 from ._parameters import resolve
+from ._transforms import AbstractTransform
+from ._triangular import semidefinite_cholesky, triangularise
 
 
 class Forecast(eqx.Module):
@@ -50,10 +51,15 @@ def forecast(estimate: Estimate, *, until: float | None = None, times: Any = Non
     finite.
     """
     objective = estimate.objective if isinstance(estimate.objective, MarginalLikelihood) else MarginalLikelihood()
-    recorded = np.asarray(estimate.recording.times)
-    ahead = _times_ahead(recorded, until, times)
-    filtered = objective.filter(estimate.model, estimate.recording)
-    grid = jnp.concatenate([estimate.recording.times[-1:], jnp.asarray(ahead)])
+    series = estimate.recording
+    if isinstance(series, tuple):
+        raise InputError(
+            f"`forecast` continues one recording, but the estimate is of {len(series)}: fit that one alone, or filter "
+            "it with the estimate's model."
+        )
+    ahead = _times_ahead(np.asarray(series.times), until, times)
+    filtered = objective.filter(estimate.model, series)
+    grid = jnp.concatenate([series.times[-1:], jnp.asarray(ahead)])
     start = filtered.filtered_means[-1], filtered.filtered_covariances[-1]
     result = _push_forward(resolve(estimate.model), objective.transform, grid, *start)
     if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in (*jax.tree.leaves(result), *start)):
@@ -78,17 +84,15 @@ def _times_ahead(recorded: np.ndarray, until: float | None, times: Any) -> np.nd
 
 
 @eqx.filter_jit
-def _push_forward(model: StateSpaceModel, transform: UnscentedTransform, grid: Array, m: Array, P: Array):
-    R = model.measurement_noise.covariance()
-
+def _push_forward(model: StateSpaceModel, transform: AbstractTransform, grid: Array, m: Array, P: Array):
     def step(carry, interval):
-        x, m, P = carry
-        moments = transform.moments(lambda s: model.dynamics(s, interval), m, transform.offsets(P))
-        m, P = moments.mean, moments.covariance + model.process_noise.covariance(interval)
+        x, m, root = carry
+        moments = model.predict(transform, m, root, interval)
+        m, root = moments.mean, triangularise(moments.factor)[0]
         x = model.dynamics(x, interval)
-        read = transform.moments(lambda s: model.observation(s, None), m, transform.offsets(P))
-        sd = jnp.sqrt(jnp.diagonal(read.covariance + R))
-        return (x, m, P), (model.observation(x, None), read.mean, sd, x, m, P)
+        read = model.read(transform, m, root, None)
+        sd = jnp.sqrt(jnp.diagonal(read.covariance))
+        return (x, m, root), (model.observation(x, None), read.mean, sd, x, m, root @ root.T)
 
-    _, ahead = jax.lax.scan(step, (m, m, P), intervals_between(grid))
+    _, ahead = jax.lax.scan(step, (m, m, semidefinite_cholesky(P)), intervals_between(grid))
     return Forecast(grid[1:], *ahead)

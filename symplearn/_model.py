@@ -11,7 +11,11 @@ from jaxtyping import Array, Float, Int, PyTree
 
 import integrators as ig
 
+from ._errors import InputError
+from ._noise import enter
 from ._parameters import AbstractKnown
+from ._transforms import AbstractTransform, Moments
+from ._triangular import semidefinite_cholesky
 
 
 class Gaussian(AbstractKnown):
@@ -22,6 +26,11 @@ class Gaussian(AbstractKnown):
 
     mean: Any
     covariance: Any
+
+    @property
+    def root(self) -> Float[Array, "d d"]:
+        """Lower triangular, root root' = covariance."""
+        return semidefinite_cholesky(jnp.asarray(self.covariance))
 
 
 class Interval(eqx.Module):
@@ -71,7 +80,7 @@ class AbstractAffine(eqx.Module):
 class LinearDynamics(AbstractAffine):
     """x' = A x + B u, the dynamics of (3.1): A (state, state), B (state, input) or None. One step per data interval.
 
-    **Raises:** `ValueError` where B is given and the recording has no inputs.
+    **Raises:** `InputError` where B is given and the recording has no inputs.
     """
 
     A: Any
@@ -90,7 +99,9 @@ def _driven(matrix: Any, context: Any, size: int, owner: str) -> Array:
         return jnp.zeros(size)
     given = getattr(context, "input", None)
     if given is None:
-        raise ValueError(f"`{owner}` has an input matrix, but the recording has no inputs; give `TimeSeries` its `inputs`.")
+        raise InputError(
+            f"`{owner}` has an input matrix, but the recording has no inputs; give `TimeSeries` its `inputs`."
+        )
     return matrix @ given
 
 
@@ -143,7 +154,7 @@ class Coordinates(AbstractAffine):
 class LinearObservation(AbstractAffine):
     """A linear reading: h(x, u) = matrix x + feedthrough u, the H (channel, state) and D (channel, input) of (3.1).
 
-    **Raises:** `ValueError` where a feedthrough is given and the recording has no inputs.
+    **Raises:** `InputError` where a feedthrough is given and the recording has no inputs.
     """
 
     matrix: Any
@@ -157,28 +168,72 @@ class LinearObservation(AbstractAffine):
         return reading + _driven(self.feedthrough, context, reading.shape[0], "LinearObservation")
 
 
-class StateSpaceModel(eqx.Module):
-    """A hidden Markov model with additive Gaussian noise. Dissertation (2.5).
+class AbstractStateSpaceModel(eqx.Module):
+    """What a Gaussian filter asks of a hidden Markov model: where it starts, and two kinds of moments."""
+
+    initial: eqx.AbstractVar[Any]
+
+    @property
+    @abc.abstractmethod
+    def reads_exactly(self) -> bool:
+        """Whether `read` is exact and takes any square root of the covariance, of any number of columns."""
+
+    @abc.abstractmethod
+    def predict(
+        self,
+        transform: AbstractTransform,
+        mean: Float[Array, " state"],
+        root: Float[Array, "state state"],
+        interval: Any,
+    ) -> Moments:
+        """Moments of the state after a data interval (2.6), noise included, for x with `mean` and root root'."""
+
+    @abc.abstractmethod
+    def read(
+        self, transform: AbstractTransform, mean: Float[Array, " state"], root: Float[Array, "state _"], context: Any
+    ) -> Moments:
+        """Moments of a reading (2.7), noise included, for x with `mean` and root root'."""
+
+
+class StateSpaceModel(AbstractStateSpaceModel):
+    """A hidden Markov model with noise that is added or multiplied. Dissertation (2.5), (2.9).
 
     x_{k+1} = dynamics(x_k, interval_k) + xi_k,  y_k = observation(x_k, context_k) + eta_k,  x_0 ~ initial.
 
     **Arguments:**
     - `dynamics`: a module `(x, interval) -> x'`. `interval` is one slice of a pytree whose leading axis
       counts the data intervals, as an `Interval` or the caller's own record.
-    - `observation`: a module `(x, context) -> y`. `context` is one slice of a pytree over the readings, or
-      None.
-    - `process_noise`: a module with `covariance(interval)` of shape (state, state).
-    - `measurement_noise`: a module with `covariance()` of shape (channel, channel).
-    - `initial`: a `Gaussian` for the state at the first reading. None means a flat prior, which only a model
-      that reads its `FullState` can have: the first reading is then conditioned on (Remark 1 after Theorem
-      2).
+    - `observation`: a module `(x, context) -> y`. `context` is one slice of a pytree over the readings, as an
+      `Instant`, or None. What is affine in x (`AbstractAffine`) is treated exactly, here and in the dynamics.
+    - `process_noise`: a noise of the state, such as `AdditiveGaussian`, or any module with `covariance(interval)`.
+    - `measurement_noise`: a noise of the readings, or any module with `covariance(context)`.
+    - `initial`: a `Gaussian` for the state at the first reading, or one for each of several recordings, in a tuple.
+      None means a flat prior, which only a model that reads its `FullState` can have: the first reading is then
+      conditioned on (Remark 1 after Theorem 2).
     """
 
     dynamics: Callable[[Any, Any], Any]
     observation: Callable[[Any, Any], Any]
     process_noise: Any
     measurement_noise: Any
-    initial: Gaussian | None = None
+    initial: Any = None
+
+    @property
+    def reads_exactly(self) -> bool:
+        return isinstance(self.observation, AbstractAffine)
+
+    def predict(self, transform, mean, root, interval) -> Moments:
+        return enter(self.process_noise, _pass(transform, self.dynamics, mean, root, interval), interval)
+
+    def read(self, transform, mean, root, context) -> Moments:
+        return enter(self.measurement_noise, _pass(transform, self.observation, mean, root, context), context)
+
+
+def _pass(transform: AbstractTransform, part: Any, mean: Array, root: Array, record: Any) -> Moments:
+    """Moments of one part of a model, exact where it is affine."""
+    if isinstance(part, AbstractAffine):
+        return Moments(part(mean, record), part.slope(mean) @ root, root)
+    return transform(lambda x: part(x, record), mean, root)
 
 
 def slice_at(records: PyTree, k: int | Int[Array, ""]) -> PyTree:

@@ -1,8 +1,10 @@
-"""Additive Gaussian noise of the dynamics and of the readings. Dissertation (2.5).
+"""Noise of the dynamics and of the readings, as its first two moments enter a filter. Dissertation (2.5), (2.9)-(2.12).
 
-Bare numbers in a noise are known; wrap them in `Positive` to learn them. All numbers are variances.
+Bare numbers in a noise are known; wrap them in `Positive` to learn them. Numbers are variances unless wrapped in
+`StandardDeviation` or `LogVariance`: what is wrapped is what a prior is over.
 """
 
+import abc
 from typing import Any
 
 import equinox as eqx
@@ -10,13 +12,64 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._parameters import AbstractKnown, AbstractParameter
+from ._transforms import Moments, with_noise
+from ._triangular import semidefinite_cholesky
 
 
 def _number(value: Any) -> Any:
     return value if isinstance(value, AbstractKnown | AbstractParameter) else jnp.asarray(value, dtype=float)
 
 
-class ScaledIdentity(AbstractKnown):
+def _root(number: Array) -> Array:
+    """The square root, with derivative 0 at 0; NaN below, which the filter reports."""
+    return jnp.where(number == 0.0, 0.0, jnp.sqrt(jnp.where(number == 0.0, 1.0, number)))
+
+
+class StandardDeviation(AbstractKnown):
+    """A variance given by its square root: `ScaledIdentity(StandardDeviation(Positive(0.05)), dim=4)`.
+
+    A prior is then over the standard deviation.
+    """
+
+    sd: Any = eqx.field(converter=_number)
+
+
+class LogVariance(AbstractKnown):
+    """A variance given by its natural logarithm, of any sign: `Diagonal(LogVariance(Learnt([-6.0, -8.0])))`.
+
+    A prior is then over the logarithm.
+    """
+
+    log_variance: Any = eqx.field(converter=_number)
+
+
+def _variance(number: Any) -> Array:
+    if isinstance(number, StandardDeviation):
+        return number.sd**2
+    return jnp.exp(number.log_variance) if isinstance(number, LogVariance) else number
+
+
+def _deviation(number: Any) -> Array:
+    if isinstance(number, StandardDeviation):
+        return jnp.abs(number.sd)
+    return jnp.exp(0.5 * number.log_variance) if isinstance(number, LogVariance) else _root(number)
+
+
+class AbstractCovariance(AbstractKnown):
+    """A covariance matrix of size (dim, dim) and a square root of it."""
+
+    @property
+    @abc.abstractmethod
+    def matrix(self) -> Float[Array, "dim dim"]:
+        """The covariance matrix."""
+
+    @property
+    @abc.abstractmethod
+    def root(self) -> Float[Array, "dim dim"]:
+        """Lower triangular, root root' = matrix."""
+
+
+class ScaledIdentity(AbstractCovariance):
     """The covariance `variance` times the identity of size `dim`."""
 
     variance: Any = eqx.field(converter=_number)
@@ -24,33 +77,57 @@ class ScaledIdentity(AbstractKnown):
 
     @property
     def matrix(self) -> Float[Array, "dim dim"]:
-        """The covariance matrix."""
-        return self.variance * jnp.eye(self.dim)
+        return _variance(self.variance) * jnp.eye(self.dim)
+
+    @property
+    def root(self) -> Float[Array, "dim dim"]:
+        return _deviation(self.variance) * jnp.eye(self.dim)
 
 
-class Diagonal(AbstractKnown):
+class Diagonal(AbstractCovariance):
     """The covariance with `variances` (dim,) on its diagonal."""
 
     variances: Any = eqx.field(converter=_number)
 
     @property
     def matrix(self) -> Float[Array, "dim dim"]:
-        """The covariance matrix."""
-        return jnp.diag(self.variances)
+        return jnp.diag(_variance(self.variances))
+
+    @property
+    def root(self) -> Float[Array, "dim dim"]:
+        return jnp.diag(_deviation(self.variances))
 
 
-class Dense(AbstractKnown):
-    """A known covariance (dim, dim), symmetric and positive semi-definite."""
+class Dense(AbstractCovariance):
+    """A covariance (dim, dim), symmetric and positive semi-definite; `PositiveDefinite` learns one."""
 
     covariance: Any = eqx.field(converter=_number)
 
     @property
     def matrix(self) -> Float[Array, "dim dim"]:
-        """The covariance matrix."""
         return self.covariance
 
+    @property
+    def root(self) -> Float[Array, "dim dim"]:
+        return semidefinite_cholesky(self.covariance)
 
-class AdditiveGaussian(eqx.Module):
+
+class AbstractNoise(eqx.Module):
+    """What the dynamics or the readings add to their noiseless value: one draw per data interval or per reading."""
+
+    @abc.abstractmethod
+    def enter(self, moments: Moments, interval: Any = None) -> Moments:
+        """The moments with the noise in."""
+
+
+def enter(noise: Any, moments: Moments, record: Any) -> Moments:
+    """The moments with a noise in: an `AbstractNoise`, or any module with `covariance(record)`, which is added."""
+    if hasattr(noise, "enter"):
+        return noise.enter(moments, record)
+    return with_noise(moments, semidefinite_cholesky(noise.covariance(record)))
+
+
+class AdditiveGaussian(AbstractNoise):
     """Independent zero-mean Gaussian noise: one draw per reading, or one per data interval.
 
     As process noise its variances are per data interval, as in the dissertation, and not comparable across
@@ -63,8 +140,11 @@ class AdditiveGaussian(eqx.Module):
         """The covariance of one draw."""
         return self.structure.matrix
 
+    def enter(self, moments: Moments, interval: Any = None) -> Moments:
+        return with_noise(moments, self.structure.root)
 
-class WienerIncrement(eqx.Module):
+
+class WienerIncrement(AbstractNoise):
     """Process noise that adds up over time: the structure's variances are per unit time, times the
     interval's length.
 
@@ -76,3 +156,47 @@ class WienerIncrement(eqx.Module):
     def covariance(self, interval: Any) -> Float[Array, "dim dim"]:
         """The covariance of the noise gathered over one data interval."""
         return self.structure.matrix * interval.length
+
+    def enter(self, moments: Moments, interval: Any) -> Moments:
+        return with_noise(moments, self.structure.root * _root(interval.length))
+
+
+class Additive(AbstractNoise):
+    """Added noise of any distribution, by its mean and covariance: exact moments in (2.6), (2.7), whatever it is.
+
+    `distribution` is one of this package's, as `Uniform(-0.1, 0.1)`, or anything with `mean` (dim,) and `structure`, a
+    covariance; a particle filter needs its `sample` and `log_density` as well.
+    """
+
+    distribution: Any
+
+    def enter(self, moments: Moments, interval: Any = None) -> Moments:
+        shifted = moments._replace(mean=moments.mean + self.distribution.mean)
+        return with_noise(shifted, self.distribution.structure.root)
+
+
+class Multiplicative(AbstractNoise):
+    """Noise that multiplies each entry, and noise added after: f .* w + xi. Dissertation (2.9)-(2.12).
+
+    `factor` is the distribution of w, as `Uniform(0.9, 1.1)`, entries independent or not; `additive` an
+    `AdditiveGaussian`, `Additive` or `WienerIncrement`, or None. The moments are exact for any distribution:
+    E = E[f] .* E[w], Var = Var[f] .* (Var[w] + E[w] E[w]') + E[f] E[f]' .* Var[w] + Var[xi].
+    """
+
+    factor: Any
+    additive: Any = None
+
+    def enter(self, moments: Moments, interval: Any = None) -> Moments:
+        mean, structure = self.factor.mean, self.factor.structure
+        scaled = Moments(moments.mean * mean, moments.factor * mean[:, None], moments.source)
+        spread = moments.mean[:, None] * structure.root
+        multiplied = with_noise(scaled, spread, _hadamard_root(moments.factor, structure))
+        return multiplied if self.additive is None else self.additive.enter(multiplied, interval)
+
+
+def _hadamard_root(factor: Array, structure: Any) -> Array:
+    """A factor of (factor factor') .* matrix; with a dense matrix, the columns' products two by two."""
+    if isinstance(structure, ScaledIdentity | Diagonal):
+        return structure.root * _root(jnp.sum(factor**2, axis=1))[:, None]
+    products = factor[:, :, None] * structure.root[:, None, :]
+    return products.reshape(factor.shape[0], -1)

@@ -7,12 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from ._errors import InputError
-from ._filter import STANDARD, Filtered, UnscentedTransform, log_likelihood, unscented_filter
-from ._model import FullState, Gaussian, StateSpaceModel, intervals_between
+from ._filter import Filtered, log_likelihood, unscented_filter
+from ._model import AbstractStateSpaceModel, FullState, Gaussian, Instant, Interval, intervals_between, slice_at
 from ._parameters import resolve
+from ._transforms import STANDARD, AbstractTransform, Taylor
 
 
 class TimeSeries(eqx.Module):
@@ -27,13 +28,13 @@ class TimeSeries(eqx.Module):
 
 
 def as_time_series(recording: Any) -> TimeSeries:
-    """The times and readings of a recording as arrays, checked.
+    """The times, readings and inputs of a recording as arrays, checked.
 
     **Raises:** `InputError` where shapes disagree, times do not increase or there are fewer than two rows.
     """
-    times, readings = recording.times, recording.readings
+    times, readings, inputs = recording.times, recording.readings, getattr(recording, "inputs", None)
     if isinstance(times, jax.core.Tracer):
-        return TimeSeries(times, readings)
+        return TimeSeries(times, readings, inputs)
     times, readings = np.asarray(times, dtype=float), np.asarray(readings, dtype=float)
     if times.ndim != 1 or readings.ndim != 2 or len(times) != len(readings) or len(times) < 2:
         raise InputError(
@@ -44,72 +45,134 @@ def as_time_series(recording: Any) -> TimeSeries:
         raise InputError("The times of a recording must be finite and strictly increasing; sort or clean them first.")
     if np.any(np.isinf(readings)):
         raise InputError("A recording has infinite readings; give NaN where a reading is missing.")
-    return TimeSeries(jnp.asarray(times), jnp.asarray(readings))
+    return TimeSeries(jnp.asarray(times), jnp.asarray(readings), _input_rows(inputs, times))
+
+
+def _input_rows(inputs: Any, times: np.ndarray) -> Array | None:
+    """The inputs at the rows: given as an array, or as the `Inputs` of a recording that was read from a file."""
+    if inputs is None:
+        return None
+    rows = np.asarray(
+        inputs.at(times) if hasattr(inputs, "at") and not hasattr(inputs, "shape") else inputs, dtype=float
+    )
+    if rows.ndim != 2 or len(rows) != len(times) or not np.all(np.isfinite(rows)):
+        raise InputError(
+            f"The inputs of a recording must be finite and of shape (n, inputs) with n = {len(times)} rows, but have "
+            f"the shape {rows.shape}."
+        )
+    return jnp.asarray(rows)
+
+
+def as_recordings(recording: Any) -> tuple[TimeSeries, ...]:
+    """One recording, or a list or tuple of them, as time series.
+
+    **Raises:** `InputError` as `as_time_series`, and for an empty list.
+    """
+    several = recording if isinstance(recording, list | tuple) else (recording,)
+    if not several:
+        raise InputError("No recording was given; give one, or a list of at least one.")
+    return tuple(as_time_series(one) for one in several)
 
 
 class AbstractObjective(eqx.Module):
-    """Scores a model against a recording, in nats; lower is better."""
+    """Scores a model against one recording or several, in nats; lower is better."""
 
     @abc.abstractmethod
-    def __call__(self, model: StateSpaceModel, recording: Any) -> Float[Array, ""]:
-        """Minus the log density of the recording under the model."""
+    def score(self, model: Any, series: TimeSeries) -> Float[Array, ""]:
+        """Minus the log density of one recording under a model whose `initial` is for that recording."""
+
+    def __call__(self, model: Any, recording: Any) -> Float[Array, ""]:
+        """Minus the log density of the recording, or of independent recordings in a list or tuple: their sum."""
+        recordings = as_recordings(recording)
+        return sum(
+            (self.score(one_of(model, k, len(recordings)), series) for k, series in enumerate(recordings)),
+            jnp.zeros(()),
+        )
+
+
+def one_of(model: Any, k: int, count: int) -> Any:
+    """The model of recording k: with its own initial distribution where the model has one for each."""
+    if not isinstance(model.initial, tuple):
+        return model
+    if len(model.initial) != count:
+        raise InputError(
+            f"The model has {len(model.initial)} initial distributions, but there are {count} recordings; give one for "
+            "each, or one for all."
+        )
+    return eqx.tree_at(lambda m: m.initial, model, model.initial[k], is_leaf=_is_none)
 
 
 class MarginalLikelihood(AbstractObjective):
-    """Minus the log marginal likelihood (2.4) by the unscented Kalman filter; +inf where the filter fails.
+    """Minus the log marginal likelihood (2.4) by the Gaussian filter; +1e15 where the filter fails.
 
     The propagator's intervals are those between the recording's times. Without an `initial` distribution the
-    first reading of the full state is conditioned on, which is a flat prior on the state it reads.
+    first reading of the full state is conditioned on, which is a flat prior on the state it reads. `transform` is the
+    rule for the moments of what is not affine.
     """
 
-    transform: UnscentedTransform = STANDARD
+    transform: AbstractTransform = STANDARD
 
-    def __call__(self, model: StateSpaceModel, recording: Any) -> Float[Array, ""]:
-        model, readings, intervals = prepare(model, as_time_series(recording))
-        return -log_likelihood(model, readings, intervals, transform=self.transform)
+    def score(self, model: AbstractStateSpaceModel, series: TimeSeries) -> Float[Array, ""]:
+        return -log_likelihood(*prepare(model, series), transform=self.transform)
 
-    def filter(self, model: StateSpaceModel, recording: Any) -> Filtered:
-        """The filter's history behind the score."""
+    def filter(self, model: AbstractStateSpaceModel, recording: Any) -> Filtered:
+        """The filter's history behind the score of one recording."""
         return _filter(model, as_time_series(recording), self.transform)
 
 
 @eqx.filter_jit
-def _filter(model: StateSpaceModel, series: TimeSeries, transform: UnscentedTransform) -> Filtered:
-    model, readings, intervals = prepare(model, series)
-    return unscented_filter(model, readings, intervals, transform=transform)
+def _filter(model: AbstractStateSpaceModel, series: TimeSeries, transform: AbstractTransform) -> Filtered:
+    return unscented_filter(*prepare(model, series), transform=transform)
 
 
 MARGINAL_LIKELIHOOD = MarginalLikelihood()
 
 
-def prepare(model: StateSpaceModel, series: TimeSeries) -> tuple[StateSpaceModel, Array, PyTree]:
-    """The model in plain arrays with an initial distribution, the readings still to be scored, the
-    intervals."""
-    model = resolve(model)
-    noise = model.measurement_noise.covariance()
-    if noise.shape[0] != series.readings.shape[1]:
-        raise InputError(
-            f"The recording has {series.readings.shape[1]} channels, but the measurement noise is for "
-            f"{noise.shape[0]}; give one variance per channel."
-        )
-    readings = series.readings
+def prepare(
+    model: AbstractStateSpaceModel, series: TimeSeries
+) -> tuple[AbstractStateSpaceModel, Array, Interval, Instant]:
+    """The model in plain arrays with an initial distribution, the readings still to be scored, the intervals and the
+    instants of the readings."""
+    model, readings = resolve(model), series.readings
+    intervals, instants = intervals_between(series.times, series.inputs), Instant(series.times, series.inputs)
+    size = readings.shape[1] if model.initial is None else jnp.asarray(model.initial.mean).shape[0]
+    _check_channels(model, size, readings.shape[1], slice_at(instants, 0))
     if model.initial is None:
-        model = eqx.tree_at(lambda m: m.initial, model, _given_first(model, readings[0], noise), is_leaf=_is_none)
+        given = _given_first(model, readings[0], slice_at(instants, 0))
+        model = eqx.tree_at(lambda m: m.initial, model, given, is_leaf=_is_none)
         readings = readings.at[0].set(jnp.nan)
-    return model, readings, intervals_between(series.times)
+    return model, readings, intervals, instants
 
 
 def _is_none(node: Any) -> bool:
     return node is None
 
 
-def _given_first(model: StateSpaceModel, reading: Array, noise: Array) -> Gaussian:
+def _check_channels(model: Any, state: int, channels: int, instant: Instant) -> None:
+    try:
+        moments = jax.eval_shape(lambda: model.read(Taylor(), jnp.zeros(state), jnp.zeros((state, state)), instant))
+    except (TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"The recording has {channels} channels, the state {state} numbers: with these the model's observation and "
+            "measurement noise do not fit together; give one variance per channel."
+        ) from error
+    if moments.mean.shape[0] != channels:
+        raise InputError(
+            f"The recording has {channels} channels, but the model's observation gives {moments.mean.shape[0]}; give "
+            "one variance per channel and read the channels that were recorded."
+        )
+
+
+def _given_first(model: Any, reading: Array, instant: Instant) -> Gaussian:
     """The state given its first reading alone, under a flat prior."""
-    if not isinstance(model.observation, FullState):
+    if not isinstance(getattr(model, "observation", None), FullState):
         raise InputError(
             "The model has no initial distribution, and its observation is not `FullState`; give it "
             "`initial=Gaussian(mean, covariance)`."
         )
     if not isinstance(reading, jax.core.Tracer) and bool(jnp.any(jnp.isnan(reading))):
         raise InputError("The first row has missing readings; give the model `initial=Gaussian(mean, covariance)`.")
-    return Gaussian(reading, noise)
+    nothing = jnp.zeros((reading.shape[0], reading.shape[0]))
+    return Gaussian(reading, model.read(Taylor(), reading, nothing, instant).covariance)

@@ -11,8 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ._filter import STANDARD, Filtered, UnscentedTransform, semidefinite_cholesky
-from ._model import StateSpaceModel
+from ._filter import Filtered
+from ._model import AbstractStateSpaceModel
+from ._transforms import STANDARD, AbstractTransform
+from ._triangular import semidefinite_cholesky
 
 # Where the state is known exactly, slopes are central differences over this share of the state's size.
 _NUDGE = 1e-5
@@ -47,56 +49,51 @@ class _Adjoint(NamedTuple):
 
 
 def smooth(
-    model: StateSpaceModel,
+    model: AbstractStateSpaceModel,
     filtered: Filtered,
     intervals: PyTree,
     contexts: PyTree = None,
-    transform: UnscentedTransform = STANDARD,
+    transform: AbstractTransform = STANDARD,
 ) -> Smoothed:
     """Smooth what `unscented_filter` filtered; give the same model, intervals, contexts and transform.
 
-    Sarkka (2008) for the unscented smoother. On a linear model everything is exact.
+    Sarkka (2008) for the unscented smoother. On a linear model everything is exact. Where noise is multiplied, its
+    covariance is that at the filtered mean.
     """
-    A = jax.vmap(lambda m, P, interval: _slope(lambda x: model.dynamics(x, interval), m, P, transform))(
+    A, Q = jax.vmap(lambda m, P, interval: _slope_and_noise(model.predict, transform, m, P, interval))(
         filtered.filtered_means[:-1], filtered.filtered_covariances[:-1], intervals
     )
-    H = _observation_slopes(model, filtered, contexts, transform)
+    H, R = jax.vmap(lambda m, P, context: _slope_and_noise(model.read, transform, m, P, context))(
+        filtered.predicted_means, filtered.predicted_covariances, contexts
+    )
+    H = jnp.where(filtered.observed[:, :, None], H, 0.0)
     S_inverse = jax.vmap(_masked_inverse)(filtered.innovation_covariances, filtered.observed)
     K = jnp.einsum("kij,kcj,kcd->kid", filtered.predicted_covariances, H, S_inverse)
     predicted, corrected = _sweep(A, H, K, S_inverse, filtered.innovations)
     means, covariances = jax.vmap(_state)(filtered.filtered_means, filtered.filtered_covariances, corrected)
-    Q = jax.vmap(model.process_noise.covariance)(intervals)
     later = jax.tree.map(lambda leaf: leaf[1:], predicted)
     xi = jax.vmap(_noise_given_all)(Q, later.r, later.N)
     u = jnp.einsum("kcd,kd->kc", S_inverse, filtered.innovations) - jnp.einsum("kic,ki->kc", K, corrected.r)
     D = S_inverse + jnp.einsum("kic,kij,kjd->kcd", K, corrected.N, K)
-    R = model.measurement_noise.covariance()
-    eta = jax.vmap(lambda u, D: _noise_given_all(R, u, D))(u, D)
+    eta = jax.vmap(_noise_given_all)(R, u, D)
     standardised = jnp.where(filtered.observed, eta[2], 0.0)
     return Smoothed(*(means, covariances, *xi, *eta[:2], standardised, filtered.observed))
 
 
-def _slope(function, m, P, transform):
-    """The statistical slope Cov[f(x), x] P^-1, by central differences along the columns of L.
+def _slope_and_noise(part, transform, m, P, record):
+    """The statistical slope Cov[f(x), x] P^-1 of a part of the model, and the covariance of its noise given x = m.
 
-    Where P is singular its missing columns are filled with small steps along the axes.
+    Where P is singular the missing columns of its root are filled with small steps along the axes.
     """
     L = semidefinite_cholesky(P)
     step = _NUDGE * jnp.maximum(1.0, jnp.abs(m))
     L = L + jnp.diag(jnp.where(jnp.diagonal(L) > 0.0, 0.0, step))
-    half = transform.spread(m.shape[0]) ** 0.5 * L.T
-    outputs = jax.vmap(function)(jnp.concatenate([m + half, m - half]))
-    differences = 0.5 * (outputs[: m.shape[0]] - outputs[m.shape[0] :])
-    return jax.scipy.linalg.solve_triangular(half, differences, lower=False).T
-
-
-def _observation_slopes(model, filtered, contexts, transform):
-    def slope(m, P, context, seen):
-        H = _slope(lambda x: model.observation(x, context), m, P, transform)
-        return jnp.where(seen[:, None], H, 0.0)
-
-    moments = filtered.predicted_means, filtered.predicted_covariances
-    return jax.vmap(slope)(*moments, contexts, filtered.observed)
+    moments = part(transform, m, L, record)
+    # Cov[f, x] = factor source' and P = L L'.
+    half = jax.scipy.linalg.solve_triangular(L, moments.source @ moments.factor.T, lower=True)
+    slope = jax.scipy.linalg.solve_triangular(L, half, lower=True, trans=1).T
+    known = part(transform, m, jnp.zeros_like(L), record)
+    return slope, known.covariance
 
 
 def _masked_inverse(S, seen):

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import integrators as ig
-from symplearn._filter import STANDARD, UnscentedTransform, unscented_filter
+from symplearn._filter import unscented_filter
 from symplearn._model import Coordinates, Gaussian, Propagator, StateSpaceModel, intervals_between
 from symplearn._noise import AdditiveGaussian, Dense
 from symplearn._smoother import smooth
+from symplearn._transforms import STANDARD, UnscentedTransform
 
 N = 12
 SPANS = intervals_between(jnp.arange(float(N)))

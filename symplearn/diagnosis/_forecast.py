@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 
 from .._augmented import Span
 from .._errors import InputError
-from .._filter import semidefinite_cholesky
 from .._recording import Recording
 from .._rows import spans_between
+from .._triangular import semidefinite_cholesky
 from ._outlook import colour_ratio, intensity_of, start_spread, total_noise
 from ._problem import Problem
 from ._record import Forecast

@@ -37,7 +37,7 @@ class _RowNoise(eqx.Module):
 
     variance: Float[Array, " channel"]
 
-    def covariance(self) -> Float[Array, "channel channel"]:
+    def covariance(self, context: Any) -> Float[Array, "channel channel"]:
         return jnp.diag(self.variance)
 
 

@@ -1,0 +1,77 @@
+"""Square roots of covariances: triangular factors that exist for singular covariances too, without LAPACK.
+
+Small matrices a column at a time: for them a call of LAPACK costs more than the arithmetic (performance.md), and its QR
+has no derivative where the rank is deficient, as with a state that is known exactly.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+# Squared length of what is left of a row, over that of the row: below it, only round-off is left.
+_SPENT = 1e-26
+# A pivot below this share of its diagonal entry is round-off of a singular covariance: its column is dropped.
+_SINGULAR = 1e-14
+# A dropped column of a semidefinite matrix is at most 1e-7 of the diagonal; ten times more is an indefinite matrix.
+_INDEFINITE = 1e-6
+# Loops over the columns of a small matrix are laid out flat up to this size, which XLA fuses better.
+_FLAT = 16
+
+
+def triangularise(rows: Float[Array, "size column"]) -> tuple[Float[Array, "size size"], Bool[Array, " size"]]:
+    """The lower triangular L with L L' = rows rows', and which of its pivots are not zero.
+
+    By modified Gram-Schmidt on the rows, as accurate for L as Householder's QR (Bjorck 1967), so the covariance L L' is
+    positive semidefinite whatever happens. A row that depends on those before it gets a zero column.
+    """
+    size = rows.shape[0]
+    order = jnp.arange(size)
+
+    def column(rest, data):
+        j, scale = data
+        row = rest[j]
+        square = row @ row
+        good = square > _SPENT * scale
+        length = jnp.sqrt(jnp.where(good, square, 1.0))
+        direction = jnp.where(good, row / length, 0.0)
+        entries = jnp.where(order > j, rest @ direction, 0.0)
+        entries = entries.at[j].set(jnp.where(good, length, 0.0))
+        return rest - jnp.outer(entries, direction), (entries, good)
+
+    # Rows of very different size are the rule (a precise channel beside a coarse one), so each is judged by its own.
+    scales = jax.lax.stop_gradient(jnp.sum(rows**2, axis=1))
+    _, (columns, good) = jax.lax.scan(column, rows, (order, scales), unroll=min(size, _FLAT))
+    return columns.T, good
+
+
+def forward_substitution(L: Float[Array, "size size"], vector: Float[Array, " size"]) -> Float[Array, " size"]:
+    """L^-1 vector; a zero on the diagonal counts as 1, for a channel that is missing."""
+    size = L.shape[0]
+
+    def entry(rest, data):
+        j, below = data
+        value = rest[j] / jnp.where(below[j] > 0.0, below[j], 1.0)
+        return rest - value * below, value
+
+    return jax.lax.scan(entry, vector, (jnp.arange(size), L.T), unroll=min(size, _FLAT))[1]
+
+
+def semidefinite_cholesky(covariance: Float[Array, "state state"]) -> Float[Array, "state state"]:
+    """Lower Cholesky factor of a covariance that may be singular, or zero; differentiable.
+
+    A column whose pivot is below 1e-14 of its diagonal entry is set to zero, together with its derivative. A matrix
+    that is clearly indefinite gives NaN, which the filter reports.
+    """
+    size = covariance.shape[0]
+    order = jnp.arange(size)
+    scales = jax.lax.stop_gradient(jnp.abs(jnp.diagonal(covariance)))
+
+    def column(rest, j):
+        pivot, below = rest[j, j], jnp.where(order >= j, rest[:, j], 0.0)
+        good = pivot > _SINGULAR * scales[j]
+        spoilt = ~good & jnp.any(jnp.abs(below) > _INDEFINITE * jnp.sqrt(scales * scales[j]))
+        root = jnp.sqrt(jnp.where(good, pivot, 1.0))
+        entries = jnp.where(good, below / root, jnp.where(spoilt, jnp.nan, 0.0))
+        return rest - jnp.outer(entries, entries), entries
+
+    return jax.lax.scan(column, covariance, order, unroll=min(size, _FLAT))[1].T
