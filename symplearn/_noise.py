@@ -1,7 +1,7 @@
 """Noise of the dynamics and of the readings, as its first two moments enter a filter. Dissertation (2.5), (2.9)-(2.12).
 
-Bare numbers in a noise are known; wrap them in `Positive` to learn them. Numbers are variances unless wrapped in
-`StandardDeviation` or `LogVariance`: what is wrapped is what a prior is over.
+Bare numbers in a noise are known; wrap them in `Positive`, or a matrix in `PositiveDefinite`, to learn them. Numbers
+are variances unless wrapped in `StandardDeviation` or `LogVariance`: what is wrapped is what a prior is over.
 """
 
 import abc
@@ -20,8 +20,9 @@ def _number(value: Any) -> Any:
     return value if isinstance(value, AbstractKnown | AbstractParameter) else jnp.asarray(value, dtype=float)
 
 
-def _root(number: Array) -> Array:
+def _root(number: Any) -> Array:
     """The square root, with derivative 0 at 0; NaN below, which the filter reports."""
+    number = jnp.asarray(number)
     return jnp.where(number == 0.0, 0.0, jnp.sqrt(jnp.where(number == 0.0, 1.0, number)))
 
 
@@ -112,6 +113,26 @@ class Dense(AbstractCovariance):
         return semidefinite_cholesky(self.covariance)
 
 
+class Correlated(AbstractCovariance):
+    """The covariance with `variances` (dim,) on its diagonal and the matrix `correlation` (dim, dim).
+
+    A dense covariance whose `variances` may be wrapped as those of `Diagonal`; `Correlation` learns the rest:
+    `Correlated(StandardDeviation(Positive(sds)), Correlation(matrix))` (Barnard, McCulloch and Meng 2000).
+    """
+
+    variances: Any = eqx.field(converter=_number)
+    correlation: Any = eqx.field(converter=_number)
+
+    @property
+    def matrix(self) -> Float[Array, "dim dim"]:
+        deviations = _deviation(self.variances)
+        return deviations[:, None] * self.correlation * deviations
+
+    @property
+    def root(self) -> Float[Array, "dim dim"]:
+        return _deviation(self.variances)[:, None] * semidefinite_cholesky(self.correlation)
+
+
 class AbstractNoise(eqx.Module):
     """What the dynamics or the readings add to their noiseless value: one draw per data interval or per reading."""
 
@@ -189,14 +210,11 @@ class Multiplicative(AbstractNoise):
     def enter(self, moments: Moments, interval: Any = None) -> Moments:
         mean, structure = self.factor.mean, self.factor.structure
         scaled = Moments(moments.mean * mean, moments.factor * mean[:, None], moments.source)
-        spread = moments.mean[:, None] * structure.root
-        multiplied = with_noise(scaled, spread, _hadamard_root(moments.factor, structure))
-        return multiplied if self.additive is None else self.additive.enter(multiplied, interval)
-
-
-def _hadamard_root(factor: Array, structure: Any) -> Array:
-    """A factor of (factor factor') .* matrix; with a dense matrix, the columns' products two by two."""
-    if isinstance(structure, ScaledIdentity | Diagonal):
-        return structure.root * _root(jnp.sum(factor**2, axis=1))[:, None]
-    products = factor[:, :, None] * structure.root[:, None, :]
-    return products.reshape(factor.shape[0], -1)
+        if isinstance(structure, ScaledIdentity | Diagonal):
+            second = moments.mean**2 + jnp.sum(moments.factor**2, axis=1)
+            multiplied = with_noise(scaled, _root(second)[:, None] * structure.root)
+        else:
+            second = jnp.outer(moments.mean, moments.mean) + moments.factor @ moments.factor.T
+            # Semi-definite by Schur's product theorem.
+            multiplied = with_noise(scaled, semidefinite_cholesky(second * structure.matrix))
+        return multiplied if self.additive is None else enter(self.additive, multiplied, interval)

@@ -35,7 +35,7 @@ def triangularise(rows: Float[Array, "size column"]) -> tuple[Float[Array, "size
         length = jnp.sqrt(jnp.where(good, square, 1.0))
         direction = jnp.where(good, row / length, 0.0)
         entries = jnp.where(order > j, rest @ direction, 0.0)
-        entries = entries.at[j].set(jnp.where(good, length, 0.0))
+        entries = jnp.where((order == j) & good, length, entries)
         return rest - jnp.outer(entries, direction), (entries, good)
 
     # Rows of very different size are the rule (a precise channel beside a coarse one), so each is judged by its own.
