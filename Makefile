@@ -1,7 +1,8 @@
 .POSIX:
-.PHONY: help demo test test-slow test-recordings lock clean
+.PHONY: help demo test test-slow test-recordings test-oracles agreement lock clean
 
 VENV = .venv
+LOCK = requirements.lock
 PYTHON = $(VENV)/bin/python
 PIP = $(PYTHON) -m pip --disable-pip-version-check --quiet
 OPTIONS =
@@ -24,9 +25,15 @@ test-slow: $(VENV)/project.stamp ## the tests of minutes
 test-recordings: $(VENV)/project.stamp ## the tests on real recordings, which fail where the recordings are absent
 	SYMPLEARN_REQUIRE_RECORDINGS=1 $(VENV)/bin/pytest -m recordings
 
+test-oracles: ## agreement with other packages, in an environment of its own (.venv-oracles, 1.3 GB)
+	@$(MAKE) -s VENV=.venv-oracles LOCK=requirements-oracles.lock agreement
+
+agreement: $(VENV)/project.stamp
+	$(VENV)/bin/pytest tests/oracles
+
 # Two stamps: a new lock makes the environment anew, a new pyproject.toml only installs the project again.
 # A stamp is the last thing written, so an interrupted run starts over.
-$(VENV)/lock.stamp: requirements.lock
+$(VENV)/lock.stamp: $(LOCK)
 	@python=; for candidate in python3.12 python3.11 python3 python3.13; do \
 	    if "$$candidate" -c '$(USABLE)' >/dev/null 2>&1; then python=$$candidate; break; fi; \
 	done; \
@@ -35,9 +42,9 @@ $(VENV)/lock.stamp: requirements.lock
 	        "python3.12, python3.11 or python3 on the PATH." >&2; \
 	    exit 1; \
 	fi; \
-	echo "Making $(VENV) with $$("$$python" --version) from requirements.lock: once, a few minutes."; \
+	echo "Making $(VENV) with $$("$$python" --version) from $(LOCK): once, a few minutes."; \
 	"$$python" -m venv --clear $(VENV)
-	@$(PIP) install --only-binary :all: --require-hashes -r requirements.lock
+	@$(PIP) install --only-binary :all: --require-hashes -r $(LOCK)
 	@touch $@
 
 USABLE = import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))
@@ -48,23 +55,29 @@ $(VENV)/project.stamp: $(VENV)/lock.stamp pyproject.toml
 	@touch $@
 
 # Resolved by Python 3.11, the oldest we support, from the public index alone whatever pip is configured to here.
-# Keeps the versions already pinned; `make lock OPTIONS=--upgrade` takes the newest.
+# Keeps the versions already pinned; `make lock OPTIONS=--upgrade` takes the newest. Where the two locks overlap they
+# agree: the second is resolved under the first.
 lock: ## pin what pyproject.toml asks for: names, versions, hashes
 	@rm -rf .venv-lock && python3.11 -m venv .venv-lock
 	@.venv-lock/bin/python -m pip --disable-pip-version-check --quiet install 'pip-tools>=7.5'
-	@.venv-lock/bin/python -c '$(REQUIREMENTS)' > .venv-lock/requirements.in
-	@PIP_CONFIG_FILE=/dev/null PIP_FIND_LINKS= PIP_EXTRA_INDEX_URL= CUSTOM_COMPILE_COMMAND='make lock' \
-	    .venv-lock/bin/pip-compile --quiet --no-annotate --generate-hashes --strip-extras --allow-unsafe \
-	    --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
-	    $(OPTIONS) --output-file requirements.lock .venv-lock/requirements.in
+	@.venv-lock/bin/python -c '$(REQUIREMENTS)' dev > .venv-lock/requirements.in
+	@.venv-lock/bin/python -c '$(REQUIREMENTS)' dev oracles > .venv-lock/requirements-oracles.in
+	@$(COMPILE) --output-file requirements.lock .venv-lock/requirements.in
+	@$(COMPILE) --constraint requirements.lock --output-file requirements-oracles.lock \
+	    .venv-lock/requirements-oracles.in
 	@rm -rf .venv-lock
-	@echo "Wrote requirements.lock."
+	@echo "Wrote requirements.lock and requirements-oracles.lock."
 
-REQUIREMENTS = import tomllib; \
+COMPILE = PIP_CONFIG_FILE=/dev/null PIP_FIND_LINKS= PIP_EXTRA_INDEX_URL= CUSTOM_COMPILE_COMMAND='make lock' \
+	.venv-lock/bin/pip-compile --quiet --no-annotate --generate-hashes --strip-extras --allow-unsafe \
+	--no-emit-index-url --no-emit-find-links --no-emit-trusted-host $(OPTIONS)
+
+REQUIREMENTS = import sys, tomllib; \
 	p = tomllib.load(open("pyproject.toml", "rb")); \
-	lists = p["build-system"]["requires"], p["project"]["dependencies"], p["dependency-groups"]["dev"]; \
+	lists = [p["build-system"]["requires"], p["project"]["dependencies"]]; \
+	lists += [p["dependency-groups"][name] for name in sys.argv[1:]]; \
 	print("\n".join(sum(lists, [])))
 
-clean: ## remove the environment and everything else that can be made again
-	rm -rf $(VENV) .venv-lock build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+clean: ## remove the environments and everything else that can be made again
+	rm -rf $(VENV) .venv-oracles .venv-lock build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
