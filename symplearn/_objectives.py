@@ -16,15 +16,21 @@ from ._parameters import resolve
 from ._transforms import STANDARD, AbstractTransform, Taylor
 
 
+def _array_or_none(rows: Any) -> Array | None:
+    return None if rows is None else jnp.asarray(rows)
+
+
 class TimeSeries(eqx.Module):
     """The least a recording is: increasing `times` (time,) and `readings` (time, channel), NaN if missing.
+
+    `inputs` (time, input) are known: row k acts on reading k and, held, on the interval that starts there.
 
     Wherever a recording is asked for, anything with these two attributes will do.
     """
 
-    times: Float[Array, " time"]
-    readings: Float[Array, "time channel"]
-    inputs: Float[Array, "time input"] | None = None
+    times: Float[Array, " time"] = eqx.field(converter=jnp.asarray)
+    readings: Float[Array, "time channel"] = eqx.field(converter=jnp.asarray)
+    inputs: Float[Array, "time input"] | None = eqx.field(converter=_array_or_none, default=None)
 
 
 def as_time_series(recording: Any) -> TimeSeries:
