@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -171,7 +171,11 @@ class LinearObservation(AbstractAffine):
 class AbstractStateSpaceModel(eqx.Module):
     """What a Gaussian filter asks of a hidden Markov model: where it starts, and two kinds of moments."""
 
-    initial: eqx.AbstractVar[Any]
+    if TYPE_CHECKING:  # an `AbstractVar` here reads, to type checkers, as a field before those of the subclass
+
+        @property
+        def initial(self) -> Any:
+            """A `Gaussian` for the state at the first reading."""
 
     @property
     @abc.abstractmethod

@@ -178,7 +178,7 @@ class WienerIncrement(AbstractNoise):
         """The covariance of the noise gathered over one data interval."""
         return self.structure.matrix * interval.length
 
-    def enter(self, moments: Moments, interval: Any) -> Moments:
+    def enter(self, moments: Moments, interval: Any = None) -> Moments:
         return with_noise(moments, self.structure.root * _root(interval.length))
 
 

@@ -12,6 +12,7 @@ from command_line_cases import DEMO, ROOT, environment
 from contract import check_document, strict_json
 
 PAGE = (ROOT / "docs" / "diagnose-a-recording.md").read_text(encoding="utf-8")
+LIBRARY = (ROOT / "docs" / "marginal-likelihood.md").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
@@ -81,3 +82,15 @@ def test_names_on_the_pages_exist():
 def test_pages_name_no_machine():
     """No absolute path of anybody's machine stands in README or docs."""
     assert not re.search(r"(?<![\w.~])/(?:home|work|root|Users|tmp)/", README + PAGE)
+
+
+@pytest.mark.slow
+def test_python_of_the_library_page(checkout):
+    """The Python of "Learn a model from a recording" runs in order, and what it asserts of itself holds."""
+    folder, places = checkout
+    program = "\n".join(blocks(LIBRARY, "python"))
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=folder, env=places, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    assert "converged" in done.stdout and "FAILED at reading" in done.stdout
