@@ -153,7 +153,8 @@ def _run(model, readings, intervals, contexts, transform, keep):
     step = jax.checkpoint(step, prevent_cse=False)
     counts = jnp.arange(1, readings.shape[0])
     carry, later = jax.lax.scan(step, carry, (readings[1:], intervals, later_contexts, counts))
-    return carry, first, later
+    # What a last step leaves in the tangents is past every guard inside.
+    return carry._replace(log_likelihood=guard(carry.log_likelihood)), first, later
 
 
 def _measure(model, transform, carry, predicted, reading, context, k):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ._errors import InputError
 from ._fit import Estimate
-from ._model import StateSpaceModel, intervals_between
+from ._model import AbstractStateSpaceModel, Instant, intervals_between
 from ._objectives import MarginalLikelihood
 from ._parameters import resolve
 from ._transforms import AbstractTransform
@@ -84,15 +84,21 @@ def _times_ahead(recorded: np.ndarray, until: float | None, times: Any) -> np.nd
 
 
 @eqx.filter_jit
-def _push_forward(model: StateSpaceModel, transform: AbstractTransform, grid: Array, m: Array, P: Array):
-    def step(carry, interval):
+def _push_forward(model: AbstractStateSpaceModel, transform: AbstractTransform, grid: Array, m: Array, P: Array):
+    known, instants = jnp.zeros_like(P), Instant(grid[1:])
+
+    def step(carry, data):
+        interval, instant = data
         x, m, root = carry
         moments = model.predict(transform, m, root, interval)
         m, root = moments.mean, triangularise(moments.factor)[0]
-        x = model.dynamics(x, interval)
-        read = model.read(transform, m, root, None)
+        # From a point, without a spread, the moments' mean is the deterministic path.
+        x = model.predict(transform, x, known, interval).mean
+        read = model.read(transform, m, root, instant)
+        path = model.read(transform, x, known, instant).mean
         sd = jnp.sqrt(jnp.diagonal(read.covariance))
-        return (x, m, root), (model.observation(x, None), read.mean, sd, x, m, root @ root.T)
+        return (x, m, root), (path, read.mean, sd, x, m, root @ root.T)
 
-    _, ahead = jax.lax.scan(step, (m, m, semidefinite_cholesky(P)), intervals_between(grid))
+    start = m, m, semidefinite_cholesky(P)
+    _, ahead = jax.lax.scan(step, start, (intervals_between(grid), instants))
     return Forecast(grid[1:], *ahead)

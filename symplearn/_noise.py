@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ._errors import InputError
 from ._parameters import AbstractKnown, AbstractParameter
 from ._transforms import Moments, with_noise
 from ._triangular import semidefinite_cholesky
@@ -185,13 +186,14 @@ class WienerIncrement(AbstractNoise):
 class Additive(AbstractNoise):
     """Added noise of any distribution, by its mean and covariance: exact moments in (2.6), (2.7), whatever it is.
 
-    `distribution` is one of this package's, as `Uniform(-0.1, 0.1)`, or anything with `mean` (dim,) and `structure`, a
-    covariance; a particle filter needs its `sample` and `log_density` as well.
+    `distribution` is one of this package's, as `Uniform(-0.1, 0.1, dim=2)`, or anything with `mean` (dim,) and
+    `structure`, a covariance; a particle filter needs its `sample` and `log_density` as well.
     """
 
     distribution: Any
 
     def enter(self, moments: Moments, interval: Any = None) -> Moments:
+        _check_size(self.distribution, moments, "Additive")
         shifted = moments._replace(mean=moments.mean + self.distribution.mean)
         return with_noise(shifted, self.distribution.structure.root)
 
@@ -199,7 +201,7 @@ class Additive(AbstractNoise):
 class Multiplicative(AbstractNoise):
     """Noise that multiplies each entry, and noise added after: f .* w + xi. Dissertation (2.9)-(2.12).
 
-    `factor` is the distribution of w, as `Uniform(0.9, 1.1)`, entries independent or not; `additive` an
+    `factor` is the distribution of w, as `Uniform(0.9, 1.1, dim=2)`, entries independent or not; `additive` an
     `AdditiveGaussian`, `Additive` or `WienerIncrement`, or None. The moments are exact for any distribution:
     E = E[f] .* E[w], Var = Var[f] .* (Var[w] + E[w] E[w]') + E[f] E[f]' .* Var[w] + Var[xi].
     """
@@ -208,6 +210,7 @@ class Multiplicative(AbstractNoise):
     additive: Any = None
 
     def enter(self, moments: Moments, interval: Any = None) -> Moments:
+        _check_size(self.factor, moments, "Multiplicative")
         mean, structure = self.factor.mean, self.factor.structure
         scaled = Moments(moments.mean * mean, moments.factor * mean[:, None], moments.source)
         if isinstance(structure, ScaledIdentity | Diagonal):
@@ -218,3 +221,13 @@ class Multiplicative(AbstractNoise):
             # Semi-definite by Schur's product theorem.
             multiplied = with_noise(scaled, semidefinite_cholesky(second * structure.matrix))
         return multiplied if self.additive is None else enter(self.additive, multiplied, interval)
+
+
+def _check_size(distribution: Any, moments: Moments, owner: str) -> None:
+    # One entry would be stretched over all without a word, and correlate them.
+    given, needed = jnp.shape(distribution.mean), moments.mean.shape
+    if given != needed:
+        raise InputError(
+            f"`{owner}` needs a distribution of {needed[0]} entries here, but was given one of shape {given}; give it "
+            f"`dim={needed[0]}`, or one number for each entry."
+        )
