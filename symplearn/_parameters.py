@@ -1,6 +1,7 @@
-"""Numbers that learn: positive, bounded, frozen, each seen by an optimiser as a free real number."""
+"""Numbers that learn: positive, bounded, positive definite, frozen; an optimiser sees free real numbers."""
 
 import abc
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -35,7 +36,7 @@ class AbstractKnown(eqx.Module):
     """A record whose bare numbers are known: only the parameters put into it, as `Positive`, learn."""
 
 
-def _require(holds: Any, sentence: str) -> None:
+def require(holds: Any, sentence: str) -> None:
     """Refuse concrete bad values; inside a transformation there is nothing to look at."""
     if not isinstance(holds, jax.core.Tracer) and not np.all(holds):
         raise InputError(sentence)
@@ -67,7 +68,7 @@ class Positive(AbstractParameter):
 
     def __init__(self, value: Any):
         value = jnp.asarray(value, dtype=float)
-        _require(
+        require(
             value > 0,
             "`Positive` needs positive numbers, but was given 0 or less. Use `Learnt` for any sign.",
         )
@@ -93,7 +94,7 @@ class Bounded(AbstractParameter):
 
     def __init__(self, value: Any, lower: Any, upper: Any):
         value, lower, upper = (jnp.asarray(number, dtype=float) for number in (value, lower, upper))
-        _require(
+        require(
             (lower < value) & (value < upper),
             "`Bounded` needs lower < value < upper, but its value lies on or outside a bound.",
         )
@@ -107,6 +108,104 @@ class Bounded(AbstractParameter):
     def log_jacobian(self) -> Float[Array, ""]:
         slope = jax.nn.log_sigmoid(self.free) + jax.nn.log_sigmoid(-self.free)
         return jnp.sum(slope + jnp.log(self.upper - self.lower))
+
+
+class AbstractMatrixParameter(AbstractParameter):
+    """A symmetric matrix that learns as a whole: its entries have no densities of their own.
+
+    Its density is over the entries on and below the diagonal that are free to move.
+    """
+
+
+class PositiveDefinite(AbstractMatrixParameter):
+    """A symmetric positive definite matrix that learns: `Dense(PositiveDefinite(covariance))`. It starts at `value`.
+
+    `free` holds the Cholesky factor L, value = L L': the logarithms of its diagonal, then what is below it, row by row
+    (log-Cholesky; Pinheiro and Bates 1996).
+
+    **Raises:** `InputError` where the matrix is not square, symmetric and positive definite.
+    """
+
+    free: Array
+
+    def __init__(self, value: Any):
+        L = _checked_cholesky(value, "PositiveDefinite")
+        self.free = jnp.concatenate([jnp.log(jnp.diagonal(L)), L[jnp.tril_indices(L.shape[0], -1)]])
+
+    @property
+    def dim(self) -> int:
+        """The matrix is of shape (dim, dim)."""
+        return (math.isqrt(8 * self.free.shape[-1] + 1) - 1) // 2
+
+    @property
+    def value(self) -> Float[Array, "dim dim"]:
+        diagonal, below = jnp.exp(self.free[: self.dim]), self.free[self.dim :]
+        L = jnp.diag(diagonal).at[jnp.tril_indices(self.dim, -1)].set(below)
+        return L @ L.T
+
+    def log_jacobian(self) -> Float[Array, ""]:
+        # dS/dL has the determinant 2^d prod L_ii^(d - i + 1), i = 1..d (Muirhead 1982, theorem 2.1.9).
+        powers = jnp.arange(self.dim + 1, 1, -1)
+        return self.dim * math.log(2) + powers @ self.free[: self.dim]
+
+
+class Correlation(AbstractMatrixParameter):
+    """A correlation matrix that learns: `Correlated(variances, Correlation(matrix))`. It starts at `value`.
+
+    `free` holds the inverse hyperbolic tangents of its canonical partial correlations, row by row (Lewandowski,
+    Kurowicka and Joe 2009).
+
+    **Raises:** `InputError` where the matrix is not symmetric and positive definite with a diagonal of ones.
+    """
+
+    free: Array
+
+    def __init__(self, value: Any):
+        L = _checked_cholesky(value, "Correlation")
+        require(
+            jnp.abs(jnp.diagonal(jnp.asarray(value)) - 1.0) < 1e-12,
+            "`Correlation` needs ones on the diagonal; divide by the standard deviations, or use `PositiveDefinite`.",
+        )
+        left = jnp.cumsum(L[:, ::-1] ** 2, axis=1)[:, ::-1]
+        partial = L / jnp.sqrt(jnp.where(left > 0, left, 1.0))
+        self.free = jnp.arctanh(partial[jnp.tril_indices(L.shape[0], -1)])
+
+    @property
+    def dim(self) -> int:
+        """The matrix is of shape (dim, dim)."""
+        return (math.isqrt(8 * self.free.shape[-1] + 1) + 1) // 2
+
+    @property
+    def value(self) -> Float[Array, "dim dim"]:
+        partial = jnp.eye(self.dim).at[jnp.tril_indices(self.dim, -1)].set(jnp.tanh(self.free))
+        L = partial * jnp.exp(0.5 * self._log_left())
+        return (L @ L.T).at[jnp.diag_indices(self.dim)].set(1.0)
+
+    def _log_left(self) -> Float[Array, "dim dim"]:
+        """What the columns before j leave of the unit length of row i, squared, as a logarithm."""
+        nothing = jnp.zeros((self.dim, self.dim))
+        # log(1 - tanh(a)^2) without the difference of ones.
+        spent = 2 * (math.log(2) - jnp.logaddexp(self.free, -self.free))
+        spent = nothing.at[jnp.tril_indices(self.dim, -1)].set(spent)
+        return jnp.cumsum(spent, axis=1) - spent
+
+    def log_jacobian(self) -> Float[Array, ""]:
+        left, below = 0.5 * self._log_left(), jnp.tril_indices(self.dim, -1)
+        tanh = jnp.sum(2 * (math.log(2) - jnp.logaddexp(self.free, -self.free)))
+        # From partial correlations to the rows of L, and from these to R = L L'; both maps are triangular.
+        return tanh + jnp.sum(left[below]) + jnp.arange(self.dim - 1, -1, -1) @ jnp.diagonal(left)
+
+
+def _checked_cholesky(value: Any, owner: str) -> Float[Array, "dim dim"]:
+    matrix = jnp.asarray(value, dtype=float)
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1] or matrix.shape[0] == 0:
+        raise InputError(f"`{owner}` needs a square matrix, but was given the shape {matrix.shape}.")
+    L = jnp.linalg.cholesky(matrix)
+    require(
+        (jnp.abs(matrix - matrix.T) <= 1e-10 * jnp.max(jnp.abs(matrix))) & jnp.all(jnp.isfinite(L)),
+        f"`{owner}` needs a symmetric positive definite matrix; `Dense` with a bare matrix takes a singular one.",
+    )
+    return L
 
 
 class Frozen(AbstractKnown):
