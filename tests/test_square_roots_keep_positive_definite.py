@@ -1,0 +1,102 @@
+"""The square-root filter keeps a right, positive definite covariance where the covariance form has lost it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import sympy
+
+from symplearn._filter import kalman_filter
+from symplearn._model import Gaussian, Interval, LinearDynamics, LinearObservation, StateSpaceModel
+from symplearn._noise import AdditiveGaussian, ScaledIdentity
+from symplearn._triangular import forward_substitution, semidefinite_cholesky, triangularise
+
+# 1 + EPSILON^2 is 1 in double precision: the textbook case of Bierman (1977) and Verhaegen and Van Dooren (1986).
+EPSILON = 2.0**-27
+
+
+def exact_posterior():
+    """Covariance given two nearly equal, precise readings, in rational arithmetic."""
+    e = sympy.Rational(1, 2**27)
+    H = sympy.Matrix([[1, 1, 1], [1, 1, 1 + e]])
+    S = H * H.T + e**2 * sympy.eye(2)
+    return np.array((sympy.eye(3) - H.T * S.inv() * H).evalf(30).tolist(), dtype=float)
+
+
+def readings_matrix():
+    return np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 1.0 + EPSILON]])
+
+
+def test_nearly_equal_precise_readings_leave_the_right_covariance():
+    """Where the textbook's P - K S K' has no digit left, the filter has the rational result to 1e-7."""
+    H, truth = readings_matrix(), exact_posterior()
+    noises = AdditiveGaussian(ScaledIdentity(0.0, 3)), AdditiveGaussian(ScaledIdentity(EPSILON**2, 2))
+    model = StateSpaceModel(
+        LinearDynamics(jnp.eye(3)), LinearObservation(jnp.asarray(H)), *noises, Gaussian(jnp.zeros(3), jnp.eye(3))
+    )
+    once = Interval(jnp.zeros(1), jnp.ones(1))
+    ys = jnp.array([[0.0, 0.0], [jnp.nan, jnp.nan]])
+    found = np.asarray(kalman_filter(model, ys, once).filtered_covariances[0])
+    # The readings tell the difference of two numbers to 2^-27; its square root is what double precision keeps.
+    np.testing.assert_allclose(found, truth, atol=1e-7)
+    # L L' is semidefinite; forming it, and eigvalsh, round to a few 1e-16 of the largest entry.
+    assert np.linalg.eigvalsh(found).min() > -1e-15
+    S = H @ H.T + EPSILON**2 * np.eye(2)
+    with np.errstate(all="ignore"):
+        textbook = np.eye(3) - H.T @ np.linalg.pinv(S, rcond=0) @ H
+    assert np.abs(textbook - truth).max() > 0.1
+
+
+def test_ten_thousand_precise_readings_never_lose_it():
+    """After 10,000 updates with noises twelve orders apart every covariance still has no negative eigenvalue."""
+    n, A = 10_000, np.array([[1.0, 1.0], [0.0, 1.0]])
+    noises = AdditiveGaussian(ScaledIdentity(1e-16, 2)), AdditiveGaussian(ScaledIdentity(1e-12, 1))
+    parts = LinearDynamics(jnp.asarray(A)), LinearObservation(jnp.eye(1, 2))
+    model = StateSpaceModel(*parts, *noises, Gaussian(jnp.zeros(2), 1e6 * jnp.eye(2)))
+    spans = Interval(jnp.arange(n - 1.0), jnp.arange(1.0, n))
+    found = jax.jit(kalman_filter)(model, jnp.zeros((n, 1)), spans)
+    covariances = np.asarray(found.filtered_covariances)
+    smallest = np.linalg.eigvalsh(covariances)[:, 0] / np.trace(covariances, axis1=1, axis2=2)
+    assert bool(found.ok) and smallest.min() > -1e-15
+    assert np.array_equal(covariances, np.swapaxes(covariances, 1, 2))
+
+
+@pytest.mark.parametrize("shape", [(1, 3), (4, 4), (5, 12), (20, 45)])
+def test_triangularise_is_qr(shape):
+    """L is lower triangular with positive diagonal and L L' = M M', as NumPy's QR of M' has it."""
+    M = np.random.default_rng(0).normal(size=shape) * np.logspace(0, -6, shape[0])[:, None]
+    L, good = triangularise(jnp.asarray(M))
+    R = np.linalg.qr(M.T, mode="r")
+    expected = (R * np.sign(np.diagonal(R))[:, None]).T
+    np.testing.assert_allclose(np.asarray(L) / np.logspace(0, -6, shape[0])[:, None],
+                               expected / np.logspace(0, -6, shape[0])[:, None], atol=1e-13)  # fmt: skip
+    assert bool(jnp.all(good)) and np.array_equal(L, np.tril(L))
+
+
+def test_dependent_rows_get_a_zero_column():
+    """A row that repeats another adds no pivot, and its derivative is finite."""
+    M = jnp.array([[1.0, 2.0, 0.0], [2.0, 4.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 1.0]])
+    L, good = triangularise(M)
+    np.testing.assert_allclose(L @ L.T, M @ M.T, atol=1e-14)
+    assert good.tolist() == [True, False, False, True] and not np.any(L[:, 1:3])
+    slope = jax.jacrev(lambda M: triangularise(M)[0])(M)
+    assert bool(jnp.all(jnp.isfinite(slope)))
+
+
+def test_forward_substitution_solves():
+    """L e = r, with a zero on the diagonal counted as a missing channel."""
+    L, r = np.array([[2.0, 0.0, 0.0], [1.0, 3.0, 0.0], [-1.0, 0.5, 0.7]]), np.array([1.0, -2.0, 0.3])
+    np.testing.assert_allclose(L @ forward_substitution(jnp.asarray(L), jnp.asarray(r)), r, atol=1e-15)
+    missing = np.array([[2.0, 0.0, 0.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.7]])
+    e = forward_substitution(jnp.asarray(missing), jnp.array([1.0, 0.0, 0.3]))
+    np.testing.assert_allclose(e, [0.5, 0.0, 0.8 / 0.7], atol=1e-15)
+
+
+def test_factors_of_semidefinite_matrices():
+    """Singular covariances have a factor, zero ones too; indefinite ones give NaN, for the filter to report."""
+    half = np.random.default_rng(1).normal(size=(5, 3))
+    L = np.asarray(semidefinite_cholesky(jnp.asarray(half @ half.T)))
+    np.testing.assert_allclose(L @ L.T, half @ half.T, atol=1e-12)
+    assert not np.any(semidefinite_cholesky(jnp.zeros((3, 3))))
+    for wrong in ([[1.0, 2.0], [2.0, 1.0]], [[0.0, 1.0], [1.0, 0.0]], [[-1.0, 0.0], [0.0, 1.0]]):
+        assert bool(jnp.any(jnp.isnan(semidefinite_cholesky(jnp.array(wrong)))))
