@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from ._filter import Filtered
 from ._model import AbstractStateSpaceModel
 from ._transforms import STANDARD, AbstractTransform
-from ._triangular import semidefinite_cholesky
+from ._triangular import lower_inverse, semidefinite_cholesky
 
 # Where the state is known exactly, slopes are central differences over this share of the state's size.
 _NUDGE = 1e-5
@@ -89,9 +89,9 @@ def _slope_and_noise(part, transform, m, P, record):
     step = _NUDGE * jnp.maximum(1.0, jnp.abs(m))
     L = L + jnp.diag(jnp.where(jnp.diagonal(L) > 0.0, 0.0, step))
     moments = part(transform, m, L, record)
-    # Cov[f, x] = factor source' and P = L L'.
-    half = jax.scipy.linalg.solve_triangular(L, moments.source @ moments.factor.T, lower=True)
-    slope = jax.scipy.linalg.solve_triangular(L, half, lower=True, trans=1).T
+    # Cov[f, x] P^-1 = factor source' L'^-1 L^-1, with L^-1 source close to [1, 0].
+    inverse = lower_inverse(L)
+    slope = moments.factor @ (inverse @ moments.source).T @ inverse
     known = part(transform, m, jnp.zeros_like(L), record)
     return slope, known.covariance
 
@@ -99,8 +99,8 @@ def _slope_and_noise(part, transform, m, P, record):
 def _masked_inverse(S, seen):
     """The inverse of the innovation covariance of the channels that were read, 0 elsewhere."""
     both = seen[:, None] & seen[None, :]
-    filled = jnp.where(both, S, jnp.diag(jnp.ones(S.shape[0])))
-    return jnp.where(both, jnp.linalg.inv(filled), 0.0)
+    inverse = lower_inverse(semidefinite_cholesky(jnp.where(both, S, jnp.diag(jnp.ones(S.shape[0])))))
+    return jnp.where(both, inverse.T @ inverse, 0.0)
 
 
 def _sweep(A, H, K, S_inverse, innovations):

@@ -19,6 +19,7 @@ from ._guard import guard
 from ._model import AbstractAffine, Gaussian, Instant, Interval, StateSpaceModel, intervals_between
 from ._objectives import AbstractObjective, TimeSeries, as_recordings, as_time_series, one_of
 from ._parameters import AbstractKnown, Learnt, resolve
+from ._triangular import forward_substitution, semidefinite_cholesky
 
 
 class AbstractSegmentation(eqx.Module):
@@ -245,9 +246,10 @@ def log_densities(
         seen = ~jnp.isnan(y)
         r = jnp.where(seen, y, m) - m
         # A missing channel is given an independent unit variance and no error: exactly as if absent.
-        L = jnp.linalg.cholesky(jnp.where(seen[:, None] & seen, C, jnp.eye(y.size)))
-        e = jax.scipy.linalg.solve_triangular(L, r, lower=True)
-        return -0.5 * e @ e - jnp.sum(jnp.log(jnp.diagonal(L))) - 0.5 * math.log(2 * math.pi) * jnp.sum(seen)
+        L = semidefinite_cholesky(jnp.where(seen[:, None] & seen, C, jnp.eye(y.size)))
+        e = forward_substitution(L, r)
+        pivots = jnp.where(jnp.diagonal(L) > 0.0, jnp.diagonal(L), jnp.nan)
+        return -0.5 * e @ e - jnp.sum(jnp.log(pivots)) - 0.5 * math.log(2 * math.pi) * jnp.sum(seen)
 
     return jax.vmap(one)(readings, means, covariances)
 

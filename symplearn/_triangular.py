@@ -1,7 +1,8 @@
 """Square roots of covariances: triangular factors that exist for singular covariances too, without LAPACK.
 
-Small matrices a column at a time: for them a call of LAPACK costs more than the arithmetic (performance.md), and its QR
-has no derivative where the rank is deficient, as with a state that is known exactly.
+Small matrices a column at a time. For them a call of LAPACK costs more than the arithmetic, its QR has no derivative
+where the rank is deficient, as with a state that is known exactly, and batches of a hundred thousand of its solves were
+seen to hang on two cores (jaxlib 0.10.2).
 """
 
 import jax
@@ -54,6 +55,11 @@ def forward_substitution(L: Float[Array, "size size"], vector: Float[Array, " si
         return rest - value * below, value
 
     return jax.lax.scan(entry, vector, (jnp.arange(size), L.T), unroll=min(size, _FLAT))[1]
+
+
+def lower_inverse(L: Float[Array, "size size"]) -> Float[Array, "size size"]:
+    """L^-1, by substitution for each column of the identity."""
+    return jax.vmap(forward_substitution, in_axes=(None, 1), out_axes=1)(L, jnp.eye(L.shape[0], dtype=L.dtype))
 
 
 def semidefinite_cholesky(covariance: Float[Array, "state state"]) -> Float[Array, "state state"]:

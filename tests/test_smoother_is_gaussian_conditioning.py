@@ -97,3 +97,23 @@ def test_an_impulse_shows_where_and_when_it_acted():
     assert np.unravel_index(found[:, 1].argmax(), found[:, 1].shape) == (5,)
     # The push is 25 standard deviations of the process noise; nothing else is beyond chance plus its echo.
     assert found[5, 1] > 5.0
+
+
+def test_a_long_recording_is_smoothed():
+    """120,000 readings go through, and the states in the middle are those of the stationary smoother.
+
+    Batches of a hundred thousand small LAPACK solves hang on two cores; none is used.
+    """
+    n = 120_000
+    system = cases.linear_system()
+    ys = jnp.asarray(np.random.default_rng(0).normal(size=(n, 2)))
+    spans = intervals_between(jnp.arange(float(n)))
+    model = cases.as_model(*system)
+    run = eqx.filter_jit(lambda model, ys: smooth(model, unscented_filter(model, ys, spans), spans))
+    found = run(model, ys)
+    middle = slice(n // 2 - 100, n // 2 + 100)
+    expected = cases.Conditioned(*system, np.asarray(ys[middle]))
+    # A hundred readings away neither end is felt any more: 0.9^100 is 3e-5, and the filter forgets faster.
+    np.testing.assert_allclose(found.means[n // 2], expected.means[100], atol=1e-8)
+    np.testing.assert_allclose(found.covariances[n // 2], expected.covariances[100], atol=1e-8)
+    assert bool(jnp.all(jnp.isfinite(found.standardised_disturbances)))
