@@ -1,4 +1,4 @@
-"""Counts the floating-point operations of a traced program: a scan's body times its length, 2 n - 1 for a sum of products.
+"""Counts the floating-point operations of a traced program: a scan's body times its length, 2 n - 1 for a dot product.
 
 One operation for each entry of an element-wise result, as in section 2.3.2 of the dissertation; comparing, choosing and
 moving numbers is free; a Cholesky factorisation is n^3 / 3, as there.
@@ -9,17 +9,16 @@ import math
 import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
-_ARITHMETIC = {
-    "add", "add_any", "sub", "mul", "div", "neg", "abs", "sqrt", "rsqrt", "square", "integer_pow", "exp", "log", "sin", "cos",
-    "tanh", "logistic", "pow", "max", "min", "log1p",
-}  # fmt: skip
+_ARITHMETIC = set(
+    """add add_any sub mul div neg abs sqrt rsqrt square integer_pow exp log sin cos tanh logistic pow max min
+    log1p""".split()
+)
 _SUMS = {"reduce_sum", "reduce_max", "reduce_min", "reduce_prod"}
-_FREE = {
-    "broadcast_in_dim", "reshape", "transpose", "concatenate", "slice", "dynamic_slice", "squeeze", "select_n", "iota", "eq",
-    "ne", "lt", "le", "gt", "ge", "and", "or", "not", "is_finite", "convert_element_type", "gather", "scatter", "pad", "rev",
-    "reduce_and", "reduce_or", "stop_gradient", "copy", "sign", "split", "dynamic_update_slice", "expand_dims", "copy_p",
-    "finite_or_zero", "platform_index", "clamp",
-}  # fmt: skip
+_FREE = set(
+    """broadcast_in_dim reshape transpose concatenate slice dynamic_slice squeeze select_n iota eq ne lt le gt ge and or
+    not is_finite convert_element_type gather scatter pad rev reduce_and reduce_or stop_gradient copy sign split
+    dynamic_update_slice expand_dims copy_p finite_or_zero platform_index clamp""".split()
+)
 
 
 def operations(function, *arguments) -> int:

@@ -1,4 +1,4 @@
-"""The likelihood's operations grow linearly with n, cubically with d_x and d_y, and not with d_theta. Tables 2.1-2.3."""
+"""The likelihood costs linearly with n, cubically with d_x and d_y, and nothing with d_theta. Tables 2.1-2.3."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from operation_count import operations
 from symplearn._filter import log_likelihood
 from symplearn._model import Gaussian, LinearDynamics, LinearObservation, StateSpaceModel
 from symplearn._noise import Additive, AdditiveGaussian, Dense, Diagonal, Multiplicative, ScaledIdentity
-from symplearn._transforms import Cubature, Taylor, UnscentedTransform
+from symplearn._transforms import STANDARD, Cubature, Taylor
 
 SIZES = range(3, 10)
 
@@ -46,7 +46,7 @@ def model(dx, dy, parameters=1, linear=False, multiplied=False):
     return StateSpaceModel(*parts, *noises, Gaussian(jnp.zeros(dx), jnp.eye(dx)))
 
 
-def cost(n, dx, dy, transform=UnscentedTransform(), **options):
+def cost(n, dx, dy, transform=STANDARD, **options):
     made = model(dx, dy, **options)
     return operations(
         lambda ys: log_likelihood(made, ys, jnp.zeros(n), jnp.zeros(n + 1), transform), jnp.zeros((n + 1, dy))
@@ -112,7 +112,8 @@ def test_a_dense_multiplicative_covariance_is_cubic_too():
     """Correlated factors keep the order: Schur's product is factorised, not the columns multiplied two by two."""
 
     def correlated(dx):
-        noise = Multiplicative(Known(jnp.ones(dx), Dense(jnp.eye(dx))), Additive(Known(jnp.zeros(dx), Dense(jnp.eye(dx)))))
+        factor, added = (Known(mean, Dense(jnp.eye(dx))) for mean in (jnp.ones(dx), jnp.zeros(dx)))
+        noise = Multiplicative(factor, Additive(added))
         made = eqx.tree_at(lambda m: m.process_noise, model(dx, 2), noise)
         return operations(lambda ys: log_likelihood(made, ys, jnp.zeros(4)), jnp.zeros((5, 2)))
 
