@@ -3,6 +3,7 @@
 import atexit
 import os
 import shutil
+import signal
 import sys
 import tempfile
 import time
@@ -111,8 +112,10 @@ class _Progress:
         self._console = Console(stderr=True)
         self._begin = time.monotonic()
         self._status = self._console.status("", spinner="line") if self._console.is_terminal else None
+        self._stopped = False
 
     def __enter__(self) -> "_Progress":
+        self._handler = signal.signal(signal.SIGINT, self._stop)
         if self._status:
             self._status.start()
         return self
@@ -120,11 +123,18 @@ class _Progress:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        signal.signal(signal.SIGINT, self._handler)
         if self._status:
             self._status.stop()
 
+    def _stop(self, number: int, frame: Any) -> NoReturn:
+        self._stopped = True
+        raise KeyboardInterrupt
+
     def say(self, message: str) -> None:
-        """Tell what comes next."""
+        """Tell what comes next; here a Ctrl-C is noticed that fell into a destructor or a callback, which swallow it."""
+        if self._stopped:
+            raise KeyboardInterrupt
         passed = time.monotonic() - self._begin
         if self._status:
             self._status.update(f"{passed:4.0f} s  {message}")

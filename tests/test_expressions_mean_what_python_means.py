@@ -259,7 +259,7 @@ MONSTERS = [
 @pytest.mark.parametrize("text", MONSTERS, ids=range(len(MONSTERS)))
 def test_work_is_bounded_by_the_length(text):
     """Every text within the limits is parsed or refused in seconds, without huge numbers."""
-    begin = time.perf_counter()
+    begin = time.process_time()
     try:
         expr = parse_expression(text, NAMES, where=WHERE)
     except InputError as refused:
@@ -267,4 +267,5 @@ def test_work_is_bounded_by_the_length(text):
     else:
         exact = [max(abs(a.p), a.q) for a in expr.atoms(sympy.Rational)]
         assert max(exact, default=0) <= 10_000
-    assert time.perf_counter() - begin < 5  # seconds; the slowest takes 1 on a free core
+    # Seconds of this process's own work, whatever else the machine does: the slowest takes 1, an unbounded one hours.
+    assert time.process_time() - begin < 20

@@ -1,5 +1,6 @@
 """A run that is stopped, at whatever moment, leaves complete files under their final names or none."""
 
+import contextlib
 import signal
 import subprocess
 import time
@@ -8,6 +9,7 @@ import pytest
 from command_line_cases import COMMAND, ONE_EFFECT, environment, write_case
 from contract import check_document, strict_json
 
+from symplearn.cli import _Progress
 from symplearn.report import _directory
 
 FILES = {"augmented.toml", "report.html", "diagnosis.json"}
@@ -71,3 +73,14 @@ def test_full_disk_leaves_the_old_answer(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space left"):
         _directory.put({path: b"new" for path in old})
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == old
+
+
+def test_a_stop_that_was_swallowed_is_heard_at_the_next_step():
+    """Python drops a Ctrl-C that arrives inside a destructor; the run then stops at its next progress message."""
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), _Progress() as progress:
+        progress.say("searching")
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        progress.say("writing the report")
+    assert signal.getsignal(signal.SIGINT) is before
