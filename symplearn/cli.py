@@ -132,7 +132,7 @@ class _Progress:
         raise KeyboardInterrupt
 
     def say(self, message: str) -> None:
-        """Tell what comes next; here a Ctrl-C is noticed that fell into a destructor or a callback, which swallow it."""
+        """Tell what comes next; a Ctrl-C that a destructor or a callback swallowed is noticed here."""
         if self._stopped:
             raise KeyboardInterrupt
         passed = time.monotonic() - self._begin
