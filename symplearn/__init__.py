@@ -14,6 +14,7 @@ from ._distributions import StudentT as StudentT
 from ._distributions import Uniform as Uniform
 from ._doubled import DoubledPropagator as DoubledPropagator
 from ._doubled import doubled as doubled
+from ._dram import DRAM as DRAM
 from ._dynamic_modes import dmd as dmd
 from ._dynamic_modes import total_dmd as total_dmd
 from ._errors import InputError as InputError
@@ -25,6 +26,7 @@ from ._filter import Filtered as Filtered
 from ._filter import kalman_filter as kalman_filter
 from ._filter import log_likelihood as log_likelihood
 from ._filter import unscented_filter as unscented_filter
+from ._fit import Attempt as Attempt
 from ._fit import Estimate as Estimate
 from ._fit import fit as fit
 from ._forecast import forecast as forecast
@@ -38,7 +40,9 @@ from ._hamiltonians import Monomials as Monomials
 from ._hamiltonians import Polynomial as Polynomial
 from ._hamiltonians import PolynomialPotential as PolynomialPotential
 from ._hidden_markov import HiddenMarkovModel as HiddenMarkovModel
+from ._importance import AdaptiveImportance as AdaptiveImportance
 from ._inputs import Inputs as Inputs
+from ._learn import learn as learn
 from ._markov_estimators import full_information_markov as full_information_markov
 from ._markov_estimators import generalised_least_squares_markov as generalised_least_squares_markov
 from ._markov_estimators import least_squares_markov as least_squares_markov
@@ -58,6 +62,9 @@ from ._model import LinearObservation as LinearObservation
 from ._model import Propagator as Propagator
 from ._model import StateSpaceModel as StateSpaceModel
 from ._model import intervals_between as intervals_between
+from ._neural_hamiltonian import NSSNN as NSSNN
+from ._neural_hamiltonian import AuthorsInitialisation as AuthorsInitialisation
+from ._neural_hamiltonian import Xavier as Xavier
 from ._noise import AbstractNoise as AbstractNoise
 from ._noise import Additive as Additive
 from ._noise import AdditiveGaussian as AdditiveGaussian
@@ -69,8 +76,11 @@ from ._noise import Multiplicative as Multiplicative
 from ._noise import ScaledIdentity as ScaledIdentity
 from ._noise import StandardDeviation as StandardDeviation
 from ._noise import WienerIncrement as WienerIncrement
+from ._nuts import NUTS as NUTS
 from ._objectives import MarginalLikelihood as MarginalLikelihood
 from ._objectives import TimeSeries as TimeSeries
+from ._optimisers import Adam as Adam
+from ._optimisers import ByLeaf as ByLeaf
 from ._parameters import Bounded as Bounded
 from ._parameters import Correlation as Correlation
 from ._parameters import Frozen as Frozen
@@ -81,6 +91,10 @@ from ._parameters import resolve as resolve
 from ._particle_filter import ParticleFiltered as ParticleFiltered
 from ._particle_filter import SystematicResampling as SystematicResampling
 from ._particle_filter import particle_filter as particle_filter
+from ._posterior import Posterior as Posterior
+from ._posterior import load_posterior as load_posterior
+from ._predict import PosteriorForecast as PosteriorForecast
+from ._predict import posterior_forecast as posterior_forecast
 from ._prior import LKJ as LKJ
 from ._prior import Flat as Flat
 from ._prior import HalfNormal as HalfNormal
@@ -89,6 +103,7 @@ from ._prior import Laplace as Laplace
 from ._prior import LogDensity as LogDensity
 from ._prior import Normal as Normal
 from ._prior import Prior as Prior
+from ._random_walk import RandomWalk as RandomWalk
 from ._realisation import CorrectedHankel as CorrectedHankel
 from ._realisation import PrintedHankel as PrintedHankel
 from ._realisation import Realisation as Realisation
@@ -97,6 +112,8 @@ from ._realisation import realise as realise
 from ._realisation import realised_model as realised_model
 from ._recording import Recording as Recording
 from ._recording import read_recordings as read_recordings
+from ._sample import sample as sample
+from ._sample import sample_density as sample_density
 from ._simulate import simulate as simulate
 from ._simulation_file import parse_simulation as parse_simulation
 from ._simulation_file import read_simulation as read_simulation
@@ -114,6 +131,8 @@ from ._sparse_regression import SparseModel as SparseModel
 from ._sparse_regression import TotalVariation as TotalVariation
 from ._sparse_regression import sindy as sindy
 from ._symbolic import jax_function as jax_function
+from ._train import Trained as Trained
+from ._train import train as train
 from ._trajectory_objectives import EverySteps as EverySteps
 from ._trajectory_objectives import GaussianContinuity as GaussianContinuity
 from ._trajectory_objectives import MultipleShooting as MultipleShooting

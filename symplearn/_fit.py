@@ -1,7 +1,7 @@
 """Maximum a posteriori: the most probable model given a recording and a prior. Dissertation (2.20)."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,6 +21,17 @@ _HOPELESS = -IMPOSSIBLE
 # Up to this many parameters forward derivatives are the faster ones (performance.md).
 _FORWARD = 12
 _RESTARTS = 4
+
+
+class Attempt(NamedTuple):
+    """One of the starts of `learn`: its coefficients, its way down, and the log posterior where it ended, in nats.
+
+    None where it was impossible: its trajectory escaped.
+    """
+
+    coefficients: str
+    way: str
+    log_posterior: float | None
 
 
 class Estimate(eqx.Module):
@@ -43,6 +54,7 @@ class Estimate(eqx.Module):
     promised: float
     converged: bool
     steps: int
+    attempts: tuple[Attempt, ...] = eqx.field(static=True, default=())
 
     def values(self) -> dict[str, Array]:
         """The values learnt, by name."""
@@ -52,7 +64,17 @@ class Estimate(eqx.Module):
         lines = [f"{name} = {value}" for name, value in self.values().items()]
         end = "converged" if self.converged else "NOT CONVERGED: do not use as a MAP"
         score = f"log posterior {self.log_posterior:.3f} nats, {end}, {self.steps} steps"
-        return "\n".join(["Estimate (MAP)", *lines, score])
+        return "\n".join(["Estimate (MAP)", *lines, score, *_told(self.attempts)])
+
+
+def _told(attempts: tuple[Attempt, ...]) -> list[str]:
+    """What became of each start, in nats below the best."""
+    lines = []
+    for coefficients, way, ended in attempts:
+        best = attempts[0].log_posterior
+        said = "impossible" if ended is None or best is None else f"{best - ended:.3f} nats below the best"
+        lines.append(f"  from {coefficients}, {way}: {said}")
+    return [f"{len(attempts)} starts:", *lines] if attempts else []
 
 
 def fit(

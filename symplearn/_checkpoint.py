@@ -1,0 +1,67 @@
+"""Files from which a stopped computation goes on: arrays alone, written whole or not at all, checked when read."""
+
+import hashlib
+import io
+import os
+import zipfile
+from pathlib import Path
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from ._errors import InputError, shown
+
+
+class Checkpoint(NamedTuple):
+    """A file of the arrays of a pytree, NumPy's npz without pickles; `seal` says what computation they belong to."""
+
+    path: Path
+    seal: str
+
+    def save(self, state: PyTree) -> None:
+        """Write the arrays, whole or not at all."""
+        buffer = io.BytesIO()
+        leaves = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state))}
+        np.savez(buffer, seal=np.array(self.seal), **leaves)  # type: ignore[arg-type]
+        unfinished = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        try:
+            unfinished.write_bytes(buffer.getbuffer())
+            os.replace(unfinished, self.path)
+        finally:
+            unfinished.unlink(missing_ok=True)
+
+    def load(self, like: PyTree) -> PyTree:
+        """What was saved, in the shape of `like`; `like` itself where there is no file.
+
+        **Raises:** `InputError` where the file is damaged, or of another computation.
+        """
+        leaves, structure = jax.tree.flatten(like)
+        if not self.path.exists():
+            return like
+        try:
+            # Of bytes: of a path, NumPy leaves a damaged file open.
+            with np.load(io.BytesIO(self.path.read_bytes()), allow_pickle=False) as file:
+                own = str(file["seal"]) == self.seal and len(file.files) == len(leaves) + 1
+                arrays = [file[f"leaf{i}"] for i in range(len(leaves))] if own else []
+        except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+            raise InputError(f"The checkpoint {shown(self.path)} is damaged; remove it to start anew.") from error
+        if not own or any(a.shape != b.shape or a.dtype != b.dtype for a, b in zip(arrays, leaves, strict=True)):
+            raise InputError(
+                f"The checkpoint {shown(self.path)} is of another computation; name another file, or remove it."
+            )
+        return jax.tree.unflatten(structure, [jnp.asarray(array) for array in arrays])
+
+
+def seal_of(parts: PyTree, settings: str) -> str:
+    """A digest of every array of `parts` with its place, and of the settings in words."""
+    digest = hashlib.sha256(settings.encode())
+    for path, leaf in jax.tree_util.tree_flatten_with_path(parts)[0]:
+        if eqx.is_array(leaf):
+            plain = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+            digest.update(f"{jax.tree_util.keystr(path)} {plain.shape} {plain.dtype}".encode())
+            digest.update(np.asarray(plain).tobytes())
+    return digest.hexdigest()

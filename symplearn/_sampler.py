@@ -1,0 +1,89 @@
+"""What every sampler is asked for and gives back: draws of a density over a vector of free coordinates."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from ._errors import InputError
+from ._faults import IMPOSSIBLE
+from ._fit import guarded
+from ._whitening import Whitening
+
+LogDensity = Callable[[Any], Any]
+# Where no importance weight has a larger share, a few odd ones among near-equal weights can make a Pareto k large, but
+# no mean feels them.
+NEGLIGIBLE = 1e-3
+
+
+class Drawn(eqx.Module):
+    """Draws of equal weight, with what their sampler knows of them; None where it has no such thing.
+
+    `free` and `log_density` (nats, not normalised) are of independent chains. `divergent` and `energy` are those of
+    Hamiltonian trajectories, `accepted` is the share of proposals taken, `pareto_k` the shape of the tail of importance
+    weights and `largest_weight` the largest one's share. `evaluations` counts the density's values, those of warm-up
+    included; `gradients` likewise.
+    """
+
+    free: Float[Array, "chain draw parameter"]
+    log_density: Float[Array, "chain draw"]
+    evaluations: int
+    gradients: int = 0
+    accepted: float | None = None
+    divergent: Bool[Array, "chain draw"] | None = None
+    energy: Float[Array, "chain draw"] | None = None
+    pareto_k: float | None = None
+    largest_weight: float | None = None
+    log_evidence: float | None = None
+    log_evidence_sd: float | None = None
+    remarks: tuple[str, ...] = ()
+
+
+class AbstractSampler(eqx.Module):
+    """A way to draw from a density; its numbers are the options."""
+
+    @abc.abstractmethod
+    def draw(self, density: LogDensity, start: Whitening, key: PRNGKeyArray) -> Drawn:
+        """Draws from the density, started at what is known of its mode.
+
+        `density` is a pytree, or a function, that maps a vector (parameter,) to nats.
+        """
+
+
+def possible(value: Float[Array, "..."]) -> Float[Array, "..."]:
+    """A log density with -inf for what is not a number and for what a failed filter gives."""
+    return jnp.where(jnp.isfinite(value) & (value > 0.5 * IMPOSSIBLE), value, -jnp.inf)
+
+
+def whitened(density: LogDensity, start: Whitening, slopes: bool = False) -> LogDensity:
+    """The log density of the whitened coordinates, z with free = centre + root z; never NaN.
+
+    With `slopes` it is finite everywhere, and so are its derivatives, as Hamiltonian trajectories need.
+    """
+
+    def log_density(z):
+        return possible(density(start.free(z))) + start.log_volume
+
+    if not slopes:
+        return log_density
+    minus = guarded(lambda z: -log_density(z), start.centre.shape[0])
+    return lambda z: -minus(z)
+
+
+def refuse_counts(sampler: AbstractSampler, **least: int) -> None:
+    """Refuse an option of a sampler that is below the least that works."""
+    for name, lowest in least.items():
+        given = getattr(sampler, name)
+        if given < lowest:
+            raise InputError(f"`{type(sampler).__name__}` needs `{name}` of at least {lowest}, but was given {given}.")
+
+
+def generator(key: PRNGKeyArray) -> np.random.Generator:
+    """NumPy's random numbers from a key of JAX."""
+    data = jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key
+    return np.random.default_rng(np.asarray(data).tolist())
