@@ -1,12 +1,15 @@
 """Many networks trained at once by one program: what the experiments with the NSSNN share."""
 
 import argparse
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Array
 
@@ -28,6 +31,25 @@ class Weighted(ig.AbstractProjection):
         return self.weight * copies[0] + (1.0 - self.weight) * copies[1]
 
 
+class Deadline:
+    """The moment, of `time.monotonic`, at which the trainings of all threads stop."""
+
+    def __init__(self, moment: float = math.inf):
+        self.moment = moment
+
+
+def side_by_side(jobs: Sequence[Callable[[], Any]], deadline: Deadline) -> list[Any]:
+    """The results of the jobs: two at a time on a processor, for a program of small matrices keeps one core busy."""
+    with ThreadPoolExecutor(1 if jax.default_backend() == "gpu" else 2) as pool:
+        waiting = [pool.submit(job) for job in jobs]
+        try:
+            return [each.result() for each in waiting]
+        except BaseException:
+            # The others stop as well, and save where they are.
+            deadline.moment = -math.inf
+            raise
+
+
 class Ensemble(NamedTuple):
     """Models, recordings and keys along one leading axis, and how each is trained for so many epochs."""
 
@@ -37,12 +59,14 @@ class Ensemble(NamedTuple):
     keys: Array
     epochs: int
 
-    def run(self, what: str, path: Path, deadline: float) -> Any | None:
+    def run(self, what: str, path: Path, deadline: "Deadline") -> Any | None:
         """The best models, or None where the time was up; `path` then holds where it stopped."""
         state = _begin(self)
         words = f"{what} {self.epochs} {self.training}"
         file = Checkpoint(path, seal_of((self.models, self.recordings, self.keys), words))
-        state = run_epochs(lambda state, count: _advance(self, state, count), state, file, deadline, what)
+        state = run_epochs(
+            lambda state, count: _advance(self, state, count), state, file, lambda: deadline.moment, what
+        )
         return _best(self, state) if bool(np.all(state.epoch == self.epochs)) else None
 
 
@@ -71,8 +95,8 @@ def _best(ensemble: Ensemble, state: TrainingState) -> Any:
 _LEAST = {"width": 1, "epochs": 20, "repeats": 1}
 
 
-def options(name: str, arguments: Sequence[str]) -> tuple[float, dict[str, int], list[str]]:
-    """The moment at which to stop, of `time.monotonic`, by `--minutes M`; settings given by `--width`, `--epochs` and
+def options(name: str, arguments: Sequence[str]) -> tuple[Deadline, dict[str, int], list[str]]:
+    """When to stop, by `--minutes M`; settings given by `--width`, `--epochs` and
     `--repeats`, for a smaller study; and the other arguments."""
     parser = _Parser(prog=f"experiments.{name}", add_help=False, allow_abbrev=False)
     parser.add_argument("--minutes", type=float, default=float("inf"))
@@ -87,7 +111,7 @@ def options(name: str, arguments: Sequence[str]) -> tuple[float, dict[str, int],
     for size, number in sizes.items():
         if number < _LEAST[size]:
             parser.error(f"--{size} is {number}, but must be at least {_LEAST[size]}")
-    return time.monotonic() + 60.0 * deadline, sizes, others
+    return Deadline(time.monotonic() + 60.0 * deadline), sizes, others
 
 
 class _Parser(argparse.ArgumentParser):

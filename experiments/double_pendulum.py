@@ -14,6 +14,7 @@ many steps of Adam for the price of one, and a program as short as one piece.
 import math
 import sys
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -37,7 +38,7 @@ from symplearn._prior import Flat, HalfNormal, Prior
 from symplearn._train import Training
 
 from ._command import Run, command, print_table
-from ._ensemble import Ensemble, options
+from ._ensemble import Deadline, Ensemble, options, side_by_side
 
 STEP, OMEGA, NOISE, GRAVITY = 0.01, 20.0, 0.01, 9.81
 STARTS = {"regular": (1.0, 0.0, 0.0, 0.0), "chaotic": (2.0, 0.0, 0.0, 0.0)}
@@ -146,22 +147,21 @@ def training_of(settings: Settings, way: str) -> Training:
     return Training(pieces, prior, both, math.ceil(intervals / size))
 
 
-def study(settings: Settings, run: Run, deadline: float) -> dict[str, Any]:
+def study(settings: Settings, run: Run, deadline: Deadline) -> dict[str, Any]:
     """The best models of each way that is done by the deadline."""
     folder = run.out / "parts"
     folder.mkdir(exist_ok=True)
     series, rows = recordings(settings, run.seed), 2 * settings.repeats
     keys = jax.random.split(jax.random.key(run.seed), rows)
     starts = jnp.repeat(jnp.asarray(list(STARTS.values())), settings.repeats, axis=0)
-    found = {}
-    for way in WAYS:
+
+    def best(way: str) -> Any | None:
         models = _models(keys, starts, settings.width, way != L1)
         ensemble = Ensemble(training_of(settings, way), models, series, keys, settings.epochs)
-        best = ensemble.run(way, folder / f"{way}.npz", deadline)
-        if best is None:
-            break
-        found[way] = best
-    return found
+        return ensemble.run(way, folder / f"{way}.npz", deadline)
+
+    found = side_by_side([partial(best, way) for way in WAYS], deadline)
+    return {way: models for way, models in zip(WAYS, found, strict=True) if models is not None}
 
 
 @eqx.filter_jit
@@ -263,7 +263,7 @@ def draw(drawings: dict[str, Drawing]) -> Figure:
     return figure
 
 
-def experiment(settings: Settings, deadline: float, run: Run) -> None:
+def experiment(settings: Settings, deadline: Deadline, run: Run) -> None:
     """Train and judge, print the table, write metrics and the figure of what is done."""
     if settings != FULL:
         print(

@@ -14,6 +14,7 @@ import itertools
 import math
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,7 +40,7 @@ from symplearn._train import Training
 
 from . import _tao_results as found
 from ._command import Run, command
-from ._ensemble import Ensemble, Weighted, options
+from ._ensemble import Deadline, Ensemble, Weighted, options, side_by_side
 from ._tao_results import COUNTS, L1, MEAN, NOISES, POSTERIOR, WAYS, Cell, Judged
 
 STEP, OMEGA, START = 0.01, 20.0, np.array([0.0, -3.0])
@@ -81,7 +82,7 @@ class Row(NamedTuple):
 
 
 FULL = Settings(tuple(itertools.product(NOISES, COUNTS)), (*CORNERS, (0.05, 600)), 20, 64, 400)
-QUICK = Settings((*CORNERS, (0.05, 600)), ((0.05, 600),), 5, 16, 120)
+QUICK = Settings((*CORNERS, (0.05, 600)), ((0.05, 600),), 5, 16, 200)
 
 
 def energy(x: np.ndarray) -> np.ndarray:
@@ -179,21 +180,22 @@ def judge(systems: Any, cells: int, n: int) -> Judged:
 Results = dict[int, dict[str, Judged]]
 
 
-def study(settings: Settings, run: Run, deadline: float) -> Results:
+def study(settings: Settings, run: Run, deadline: Deadline) -> Results:
     """All trainings that are done by the deadline, from what was done before on."""
     folder = run.out / "parts"
     folder.mkdir(exist_ok=True)
     seal = f"{settings} {run.seed}"
     groups = [settings.counts] if jax.default_backend() == "gpu" else [[n] for n in settings.counts]
-    results: Results = {}
-    for group in groups:
-        if not all((folder / f"n_{n}.npz").exists() for n in group) and not _train(
-            settings, group, run.seed, folder, seal, deadline
-        ):
-            break
-        for n in group:
-            results[n] = Checkpoint(folder / f"n_{n}.npz", seal).load(_blank(settings, n))
-    return results
+
+    def done(group: list[int]) -> bool:
+        saved = all((folder / f"n_{n}.npz").exists() for n in group)
+        return saved or _train(settings, group, run.seed, folder, seal, deadline)
+
+    # The longest first, so that both cores are busy to the end.
+    groups.reverse()
+    finished = side_by_side([partial(done, group) for group in groups], deadline)
+    counts = sorted(n for group, ended in zip(groups, finished, strict=True) if ended for n in group)
+    return {n: Checkpoint(folder / f"n_{n}.npz", seal).load(_blank(settings, n)) for n in counts}
 
 
 def _blank(settings: Settings, n: int) -> dict[str, Judged]:
@@ -205,7 +207,7 @@ def _blank(settings: Settings, n: int) -> dict[str, Judged]:
     }
 
 
-def _train(settings: Settings, group: list[int], seed: int, folder: Path, seal: str, deadline: float) -> bool:
+def _train(settings: Settings, group: list[int], seed: int, folder: Path, seal: str, deadline: Deadline) -> bool:
     """Train and judge all rows of these n; whether there was the time."""
     rows = {way: settings.rows(way, group) for way in (POSTERIOR, MEAN)}
     jobs = [("_".join(map(str, group[:1] + group[1:][-1:])) + "_posterior", rows)]
@@ -231,7 +233,7 @@ def _train(settings: Settings, group: list[int], seed: int, folder: Path, seal: 
     return True
 
 
-def experiment(settings: Settings, deadline: float, run: Run) -> None:
+def experiment(settings: Settings, deadline: Deadline, run: Run) -> None:
     """Train and judge, print the table, write metrics and figures of what is done."""
     if settings != FULL:
         print(

@@ -260,13 +260,13 @@ def run_epochs(
     advance: Callable[[TrainingState, Array], TrainingState],
     state: TrainingState,
     checkpoint: Checkpoint | None = None,
-    deadline: float = math.inf,
+    deadline: Callable[[], float] = lambda: math.inf,
     what: str = "train",
 ) -> TrainingState:
     """All epochs of a state, or of many with a leading axis, a few seconds of them at a time.
 
     From the checkpoint, where there is one. It stops early, at a state whose `epoch` says so, where the next epochs
-    would end after the `deadline` of `time.monotonic`.
+    would end after the `deadline` of `time.monotonic`, which is asked each time.
     """
     if checkpoint is not None:
         state = checkpoint.load(state)
@@ -276,7 +276,7 @@ def run_epochs(
     try:
         while (done := int(np.max(state.epoch))) < epochs:
             began, count = time.monotonic(), min(count, epochs - done)
-            if began + count * each > deadline:
+            if began + count * each > deadline():
                 break
             state = jax.block_until_ready(advance(state, jnp.asarray(count)))
             now = time.monotonic()

@@ -1,9 +1,11 @@
-"""Double precision, and a private folder where compiled programs outlive the run."""
+"""Double precision, a private folder where compiled programs outlive the run, and not too many of them at once."""
 
+import gc
 import os
 from pathlib import Path
 
 import jax
+import pytest
 
 jax.config.update("jax_enable_x64", True)
 
@@ -27,3 +29,17 @@ if not os.environ.get("JAX_COMPILATION_CACHE_DIR") and (_cache := _private_cache
     jax.config.update("jax_compilation_cache_dir", str(_cache))
 # By default only programs of more than a second are kept; ours are many and small.
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+# Each compiled program takes a few memory maps, of which Linux allows a process 65,530; past that it dies.
+_MANY_MAPS = 20_000
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _forget_compiled_programs():
+    """After a file of tests, let go of compiled programs where they have become many."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_bytes().splitlines()) > _MANY_MAPS:
+        jax.clear_caches()
+        gc.collect()

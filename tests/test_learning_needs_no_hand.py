@@ -21,6 +21,8 @@ from symplearn._parameters import Frozen, Learnt, Positive, flatten, resolve
 from symplearn._prior import Flat, HalfNormal, Laplace, Normal, Prior
 from symplearn._starts import harmonic, scales, with_variances
 
+pytestmark = pytest.mark.slow  # four minutes with its neighbours of issues 4 and 5
+
 # H = p^2/2 + 0.1 q + 0.6 q^2 + 0.25 q^3 + 0.4 q^4, read in q and p every 0.4 with noise of sd 0.02.
 TRUTH = np.array([0.1, 0.6, 0.25, 0.4])
 TIMES, SD = 0.4 * np.arange(26), 0.02

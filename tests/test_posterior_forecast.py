@@ -17,6 +17,8 @@ from symplearn._predict import posterior_forecast
 from symplearn._prior import Normal, Prior
 from symplearn._sample import sample
 
+pytestmark = pytest.mark.slow  # four minutes with its neighbours of issues 4 and 5
+
 A = np.array([[0.9, 0.3], [-0.2, 0.8]])
 Q, R, P0, V = np.diag([0.04, 0.02]), 0.09 * np.eye(2), 0.25 * np.eye(2), 4.0 * np.eye(2)
 STEPS, AHEAD, DRAWS = 5, 4, 2000

@@ -18,6 +18,8 @@ from symplearn._posterior import load_posterior
 from symplearn._prior import HalfNormal, Normal, Prior
 from symplearn._sample import sample, sample_density
 
+pytestmark = pytest.mark.slow  # four minutes with its neighbours of issues 4 and 5
+
 SAMPLER = AdaptiveImportance(draws=200, batch=200, target=100, rounds=4)
 
 

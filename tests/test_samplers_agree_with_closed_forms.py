@@ -23,6 +23,8 @@ from symplearn._prior import Normal, Prior
 from symplearn._random_walk import RandomWalk
 from symplearn._sample import sample, sample_density
 
+pytestmark = pytest.mark.slow  # four minutes with its neighbours of issues 4 and 5
+
 SCOUT = AdaptiveImportance(batch=200, target=200, rounds=8)
 SAMPLERS = [
     AdaptiveImportance(batch=500, target=1500),

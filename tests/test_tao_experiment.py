@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from command_line_cases import ROOT
 
+pytestmark = pytest.mark.slow  # four minutes with its neighbours of issues 4 and 5
+
 sys.path.insert(0, str(ROOT))  # experiments are no installed package
 tao = importlib.import_module("experiments.tao")
 found = importlib.import_module("experiments._tao_results")
