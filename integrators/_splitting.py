@@ -116,12 +116,23 @@ class Tao(AbstractIntegrator):
         q, p, x, y = jnp.split(state, 4)
         early, late = hamiltonian.at(t + 0.25 * dt), hamiltonian.at(t + 0.75 * dt)
         # H(q, y) moves p and x; H(x, p) moves q and y; the binding turns the differences of the copies.
-        p, x = p - 0.5 * dt * early.slope(q, y), x + 0.5 * dt * early.velocity(q, y)
-        q, y = q + 0.5 * dt * early.velocity(x, p), y - 0.5 * dt * early.slope(x, p)
+        dx, dp = _push(early, q, y, dt)
+        x, p = x + dx, p + dp
+        dq, dy = _push(early, x, p, dt)
+        q, y = q + dq, y + dy
         q, p, x, y = _bind(q, p, x, y, 2.0 * self.omega * dt)
-        q, y = q + 0.5 * dt * late.velocity(x, p), y - 0.5 * dt * late.slope(x, p)
-        p, x = p - 0.5 * dt * late.slope(q, y), x + 0.5 * dt * late.velocity(q, y)
+        dq, dy = _push(late, x, p, dt)
+        q, y = q + dq, y + dy
+        dx, dp = _push(late, q, y, dt)
+        x, p = x + dx, p + dp
         return jnp.concatenate([q, p, x, y])
+
+
+def _push(
+    hamiltonian: AbstractHamiltonian, q: Float[Array, " d"], p: Float[Array, " d"], dt: Time
+) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
+    """The way that half a step of H(q, p), both frozen, carries the other copy's coordinates and momenta."""
+    return split(0.5 * dt * hamiltonian.vector_field(jnp.concatenate([q, p])))
 
 
 def _bind(

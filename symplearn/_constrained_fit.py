@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
-from ._fit import Estimate, negative_log_posterior
+from ._fit import Estimate
+from ._log_posterior import negative_log_posterior
 from ._model import StateSpaceModel
 from ._objectives import as_recordings
 from ._parameters import flatten, named_parameters

@@ -4,6 +4,7 @@ BFGS with a bisection to weak Wolfe conditions, which needs no smoothness (Lewis
 its gradient stand once in the compiled program, whose lanes are models of one structure: a portfolio compiles once.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,14 +12,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
-from ._faults import IMPOSSIBLE
-from ._fit import negative_log_posterior
 from ._guard import guard
+from ._log_posterior import HOPELESS, negative_log_posterior
 from ._objectives import AbstractObjective, TimeSeries
 from ._parameters import flatten, partition
 from ._prior import Prior
 
-_HOPELESS = -IMPOSSIBLE
 # Of the weak Wolfe conditions: enough decrease, and enough flattening.
 _DECREASE, _FLATTENING = 1e-4, 0.9
 # Trials of one line search: 2^-40 of the first step is no step.
@@ -88,6 +87,12 @@ def descend(
     return eqx.filter_vmap(lane, in_axes=(eqx.if_array(0), 0, 0, 0))(models, places, moves, rounding)
 
 
+def stacked(models: Sequence[Any]) -> PyTree:
+    """Models of one structure as one, each array with a leading axis."""
+    arrays, rest = zip(*[eqx.partition(model, eqx.is_array) for model in models], strict=True)
+    return eqx.combine(jax.tree.map(lambda *leaves: jnp.stack(leaves), *arrays), rest[0])
+
+
 def start(models: PyTree) -> Place:
     """The places of stacked models, before anything is known of their scores."""
 
@@ -124,9 +129,9 @@ def _descend(score, place, moves, max_steps, tolerance):
     def body(search):
         free = search.place.free + search.step * search.direction
         value, slope = value_and_slope(free)
-        sound = jnp.isfinite(value) & (value < 0.5 * _HOPELESS)
+        sound = jnp.isfinite(value) & (value < 0.5 * HOPELESS)
         slope = jnp.where(sound & jnp.isfinite(slope), slope, 0.0)
-        return _judge(search, free, jnp.where(sound, value, _HOPELESS), slope, moves, tolerance)
+        return _judge(search, free, jnp.where(sound, value, HOPELESS), slope, moves, tolerance)
 
     def going(search):
         return ~search.done & (search.evaluations < max_steps)
@@ -181,7 +186,7 @@ def _take(search: _Search, free: Array, value: Array, slope: Array, moves: Array
     direction = -moves * (inverse @ (moves * slope))
     known = jnp.any(inverse != jnp.eye(free.size))
     done = (~first | known) & (after.promised(moves) <= tolerance)
-    return _search(after, direction, ~known, search.evaluations + 1, done | (value >= _HOPELESS))
+    return _search(after, direction, ~known, search.evaluations + 1, done | (value >= HOPELESS))
 
 
 def _updated(H: Array, s: Array, y: Array, fresh: Array, curved: Array, moves: Array) -> Array:

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._fit import Estimate, gradient, negative_log_posterior
+from ._fit import Estimate
+from ._log_posterior import gradient, negative_log_posterior
 from ._parameters import flatten, named_parameters, value_of
 from ._prior import Flat, Laplace
 

@@ -1,25 +1,24 @@
 """Maximum a posteriori: the most probable model given a recording and a prior. Dissertation (2.20)."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as ox
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
+from ._descent import stacked, start
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
+from ._laplace_kinks import EVALUATIONS, ROUNDING, Task, end_at_kinks, kinks_of
+from ._learnable import refuse_unlearnable
+from ._log_posterior import guarded, negative_log_posterior
 from ._model import AbstractStateSpaceModel
 from ._objectives import MARGINAL_LIKELIHOOD, AbstractObjective, TimeSeries, as_recordings
 from ._parameters import flatten, named_parameters, value_of
 from ._prior import AbstractDensity, Prior
 
-# Stands for an infinite score inside the optimiser, which can compare it but must not subtract infinities.
-_HOPELESS = -IMPOSSIBLE
-# Up to this many parameters forward derivatives are the faster ones (performance.md).
-_FORWARD = 12
 _RESTARTS = 4
 
 
@@ -92,13 +91,16 @@ def fit(
     density such as `Flat()` for every leaf; `tolerance` - nats that a quadratic model may still promise at the
     end; `max_steps` - of one BFGS run; it is started afresh up to four times.
 
-    **Raises:** `InputError` where nothing learns, a leaf has no prior, or the start has no finite score.
+    Under a `Laplace` prior coefficients may end at exactly 0.
+
+    **Raises:** `InputError` where nothing learns, a leaf has no prior, the start has no finite score, a polynomial has
+    more terms than there are readings, the time step changes under process noise that is per data interval, or more
+    than 1500 numbers learn.
     """
     prior = prior if isinstance(prior, Prior) else Prior(prior)
     recordings = as_recordings(recording)
     series = recordings if isinstance(recording, list | tuple) else recordings[0]
-    if not named_parameters(model):
-        raise InputError("Nothing in the model learns: every number is known or `Frozen`. Wrap one in `Positive`.")
+    refuse_unlearnable(model, recordings, "fit")
     posterior, likelihood, slope = _at(model, series, objective, prior)
     # Another recording's nats may be added to the impossible one's.
     if not bool(jnp.isfinite(posterior)) or float(likelihood) <= 0.5 * IMPOSSIBLE:
@@ -106,16 +108,21 @@ def fit(
             f"The model has no finite score at its start: log likelihood {float(likelihood):.3g} and log "
             f"posterior {float(posterior):.3g} nats; start from smaller coefficients or larger noises."
         )
-    steps, promised = 0, jnp.inf
+    steps, promised = 0, float("inf")
     for _ in range(_RESTARTS):
         # The first step of BFGS is the gradient: scaled so that it has length 1 and no trajectory escapes.
         scale = 1.0 / jnp.maximum(jnp.linalg.norm(slope), 1e-12)
         model, inverse, taken = _descend(model, series, objective, prior, scale, max_steps)
         posterior, likelihood, slope = _at(model, series, objective, prior)
-        promised = 0.5 * slope @ inverse @ slope
+        promised = float(0.5 * slope @ inverse @ slope)
         steps += int(taken)
-        if float(promised) <= tolerance:
+        if promised <= tolerance:
             break
+    task = Task(series, objective, prior, kinks_of(model, prior), tolerance)
+    if bool(jnp.any(task.kinks > 0)):
+        model, slope, left, taken = _kinks_met(model, task)
+        posterior, likelihood, _ = _at(model, series, objective, prior)
+        steps, promised = steps + int(taken), float(left)
     return Estimate(
         model,
         series,
@@ -124,20 +131,20 @@ def fit(
         log_posterior=float(posterior),
         log_likelihood=float(likelihood),
         gradient_norm=float(jnp.max(jnp.abs(slope))),
-        promised=float(promised),
-        converged=float(promised) <= tolerance,
+        promised=promised,
+        converged=promised <= tolerance,
         steps=steps,
     )
 
 
-def negative_log_posterior(
-    model: AbstractStateSpaceModel,
-    series: TimeSeries | tuple[TimeSeries, ...],
-    objective: AbstractObjective,
-    prior: Prior,
-) -> Float[Array, ""]:
-    """The score of the model plus minus the log prior density of its free coordinates, in nats."""
-    return objective(model, series) - prior.log_density(model)
+def _kinks_met(model: Any, task: Task) -> tuple[Any, Array, Array, Array]:
+    """The optimum at the kinks, where BFGS stalls: the model, the slope of what moved, the nats promised, the steps."""
+    models = stacked([model])
+    places, moves = start(models), jnp.ones((1, task.kinks.size))
+    places = task.descend(models, places, moves, ROUNDING, EVALUATIONS, task.tolerance)
+    places, moves = end_at_kinks(models, places, task)
+    place = jax.tree.map(lambda leaf: leaf[0], places)
+    return flatten(model)[1](place.free), moves[0] * place.slope, place.promised(moves[0]), place.steps
 
 
 @eqx.filter_jit
@@ -152,31 +159,9 @@ def _at(model, series, objective, prior):
 @eqx.filter_jit
 def _descend(model, series, objective, prior, scale, max_steps):
     """One run of BFGS: the best model met, BFGS's own inverse Hessian of the score, the steps."""
-    start, rebuild = flatten(model)
-    score = guarded(lambda free: negative_log_posterior(rebuild(free), series, objective, prior), start.size)
+    begin, rebuild = flatten(model)
+    score = guarded(lambda free: negative_log_posterior(rebuild(free), series, objective, prior), begin.size)
     solver: Any = ox.BestSoFarMinimiser(ox.BFGS(rtol=1e-10, atol=1e-10))
-    solution: Any = ox.minimise(lambda free, _: scale * score(free), solver, start, max_steps=max_steps, throw=False)
+    solution: Any = ox.minimise(lambda free, _: scale * score(free), solver, begin, max_steps=max_steps, throw=False)
     inverse = scale * solution.state.state.f_info.hessian_inv.as_matrix()
     return rebuild(solution.value), inverse, solution.stats["num_steps"]
-
-
-def gradient(score: Callable[[Array], Array], size: int) -> Callable[[Array], Array]:
-    """The gradient of a score of `size` parameters: forward for a few, reverse for many."""
-    return jax.jacfwd(score) if size <= _FORWARD else jax.grad(score)
-
-
-def guarded(score: Callable[[Array], Array], size: int) -> Callable[[Array], Array]:
-    """`score` with a large finite number for every non-finite one, and with derivatives that are never
-    NaN."""
-
-    @jax.custom_jvp
-    def safe(free):
-        value = score(free)
-        return jnp.where(jnp.isfinite(value), value, _HOPELESS)
-
-    @safe.defjvp
-    def _(primals, tangents):
-        slope = gradient(score, size)(primals[0])
-        return safe(primals[0]), jnp.where(jnp.isfinite(slope), slope, 0.0) @ tangents[0]
-
-    return safe

@@ -215,6 +215,11 @@ class Polynomial(ig.AbstractHamiltonian):
     def slope(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
         return self._gradient(q, p)[: self.dim]
 
+    def vector_field(self, x: Float[Array, " two_d"]) -> Float[Array, " two_d"]:
+        """dx/dt at the phase point x, by one gradient."""
+        slope, velocity = ig.split(self._gradient(*ig.split(x)))
+        return jnp.concatenate([velocity, -slope])
+
     def _gradient(self, q: Array, p: Array) -> Array:
         return _gradient(self.basis, self.coefficients, jnp.concatenate([q, p]), self.degree)
 

@@ -18,28 +18,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from ._descent import Place, coordinates, descend, start
+from ._descent import Place, coordinates, stacked, start
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
 from ._fit import Attempt, Estimate
+from ._laplace_kinks import EVALUATIONS, ROUNDING, Task, end_at_kinks, kinks_of
+from ._learnable import refuse_unlearnable
 from ._model import AbstractStateSpaceModel, StateSpaceModel
-from ._noise import AdditiveGaussian
 from ._objectives import MARGINAL_LIKELIHOOD, AbstractObjective, TimeSeries, as_recordings
-from ._parameters import Learnt, flatten, named_parameters
-from ._prior import AbstractDensity, Laplace, Prior
-from ._starts import Scales, coefficient_starts, polynomial_of, scales, with_variances
+from ._parameters import flatten
+from ._prior import AbstractDensity, Prior
+from ._starts import Scales, coefficient_starts, scales, with_variances
 
 # The process noise on its way down, as shares of the readings' variance; evaluations at each, and nats left over.
 LEVELS = (1.0, 1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
 _AT_EACH, _LEFT = 40, 1e-3
-# Evaluations of a free descent between two lines of progress, and how many of these there may be.
-_FREE, _FREE_RUNS = 150, 6
-# Nats by which a kink is rounded off until the end, and how far from it, in widths, a coefficient is set to zero.
-_ROUNDING, _SNAP = 0.01, 3.0
+# Free descents, each followed by a line of progress, that there may be.
+_FREE_RUNS = 6
 # The direct starts' process noise, as a share of the readings' variance.
 _DIRECT = 0.1
-# BFGS holds a square matrix of this size for each start.
-_MOST_PARAMETERS = 1500
 
 
 def learn(
@@ -69,9 +66,9 @@ def learn(
     prior = prior if isinstance(prior, Prior) else Prior(prior)
     several = as_recordings(recordings)
     series = several if isinstance(recordings, list | tuple) else several[0]
-    _check(model, several)
+    refuse_unlearnable(model, several, "learn")
     starts = _portfolio(model, several, key)
-    places, moves = _run(starts, _Task(series, objective, prior, _kinks(model, prior), tolerance))
+    places, moves = _run(starts, Task(series, objective, prior, kinks_of(model, prior), tolerance))
     return _best(starts, places, moves, series, objective, prior, tolerance)
 
 
@@ -103,7 +100,7 @@ def _portfolio(model: Any, several: Sequence[TimeSeries], key: Any) -> list[_Sta
 
 
 def _nothing(model: Any) -> Array:
-    return jnp.zeros_like(start(_stack([model])).free[0])
+    return jnp.zeros_like(start(stacked([model])).free[0])
 
 
 def _noises(model: Any, sizes: Scales, level: float, interval: float, known: bool) -> Any:
@@ -111,37 +108,6 @@ def _noises(model: Any, sizes: Scales, level: float, interval: float, known: boo
     process = with_variances(model.process_noise, level * sizes.state, interval, known)
     measurement = with_variances(model.measurement_noise, sizes.noise, known=False)
     return eqx.tree_at(lambda m: (m.process_noise, m.measurement_noise), model, (process, measurement))
-
-
-def _stack(models: Sequence[Any]) -> Any:
-    """Models of one structure as one, each array with a leading axis."""
-    arrays, rest = zip(*[eqx.partition(model, eqx.is_array) for model in models], strict=True)
-    return eqx.combine(jax.tree.map(lambda *leaves: jnp.stack(leaves), *arrays), rest[0])
-
-
-class _Task(NamedTuple):
-    """What is scored, and how it is told."""
-
-    series: TimeSeries | tuple[TimeSeries, ...]
-    objective: AbstractObjective
-    prior: Prior
-    kinks: Array
-    tolerance: float
-
-    def descend(self, models: Any, places: Place, moves: Array, rounding: float, steps: int, left: float) -> Place:
-        """All lanes side by side; the compiled program is the same for every stage."""
-        return descend(
-            models,
-            places,
-            moves,
-            jnp.full(len(moves), rounding),
-            self.kinks,
-            self.series,
-            self.objective,
-            self.prior,
-            jnp.asarray(steps),
-            jnp.asarray(left),
-        )
 
 
 class _Progress:
@@ -162,60 +128,29 @@ class _Progress:
             )
 
 
-def _run(starts: Sequence[_Start], task: _Task) -> tuple[Place, Array]:
+def _run(starts: Sequence[_Start], task: Task) -> tuple[Place, Array]:
     """Down the levels, then free, then exact at the kinks: where every lane ended, and what moved there at last."""
     held = jnp.stack([one.held for one in starts])
     progress = _Progress(len(LEVELS) + _FREE_RUNS + 1)
-    places = start(_stack([one.levels[0] for one in starts]))
+    places = start(stacked([one.levels[0] for one in starts]))
     for k in range(len(LEVELS)):
-        models = _stack([one.levels[min(k, len(one.levels) - 1)] for one in starts])
+        models = stacked([one.levels[min(k, len(one.levels) - 1)] for one in starts])
         places = places._replace(free=jnp.where(held > 0, start(models).free, places.free))
-        places = task.descend(models, places, 1.0 - held, _ROUNDING, _AT_EACH, _LEFT)
+        places = task.descend(models, places, 1.0 - held, ROUNDING, _AT_EACH, _LEFT)
         progress.tell(places)
-    models, moves = _stack([one.final for one in starts]), jnp.ones_like(held)
+    models, moves = stacked([one.final for one in starts]), jnp.ones_like(held)
     for k in range(_FREE_RUNS):
-        places = task.descend(models, places, moves, _ROUNDING, _FREE, task.tolerance)
+        places = task.descend(models, places, moves, ROUNDING, EVALUATIONS, task.tolerance)
         progress.tell(places)
         open_lanes = ~_settled(places, moves, task.tolerance)
         # Those that lag behind get one more run; after that only the best one is waited for.
         if not bool(jnp.any(open_lanes)) or (k > 0 and not bool(open_lanes[jnp.argmin(places.score)])):
             break
-    return _exact(models, places, task)
+    return end_at_kinks(models, places, task)
 
 
 def _settled(places: Place, moves: Array, tolerance: float) -> Array:
     return (jax.vmap(Place.promised)(places, moves) <= tolerance) | (places.score >= -0.5 * IMPOSSIBLE)
-
-
-def _exact(models: Any, places: Place, task: _Task) -> tuple[Place, Array]:
-    """The descents ended with the kinks as sharp as they are.
-
-    A coefficient that ended at a kink is zero and held there, as long as the slope does not exceed the kink's.
-    """
-    width = _SNAP * _ROUNDING / jnp.where(task.kinks > 0, task.kinks, 1.0)
-    zero = (task.kinks > 0) & (jnp.abs(places.free) < width)
-    for _ in range(3):
-        moves = jnp.where(zero, 0.0, 1.0)
-        places = places._replace(free=jnp.where(zero, 0.0, places.free))
-        places = task.descend(models, places, moves, 0.0, _FREE, task.tolerance)
-        loose = zero & (jnp.abs(places.slope) > task.kinks)
-        stuck = (task.kinks > 0) & (jnp.abs(places.free) < 1e-3 * width)
-        if not bool(jnp.any(loose | (stuck & ~zero))):
-            break
-        places = places._replace(free=jnp.where(loose, -jnp.sign(places.slope) * 0.1 * width, places.free))
-        zero = (zero | stuck) & ~loose
-    return places, moves
-
-
-def _kinks(model: Any, prior: Prior) -> Array:
-    """1 / scale at the free coordinates under a Laplace prior, else 0."""
-    parts = []
-    for name, leaf in named_parameters(model).items():
-        bare, density = isinstance(leaf, Learnt) or eqx.is_array(leaf), prior.density_of(name)
-        size = getattr(leaf, "free", leaf)
-        kink = 1.0 / density.scale if bare and isinstance(density, Laplace) else 0.0
-        parts.append(jnp.ravel(jnp.broadcast_to(kink, size.shape)))
-    return jnp.concatenate(parts)
 
 
 def _best(starts, places, moves, series, objective, prior, tolerance) -> Estimate:
@@ -249,52 +184,3 @@ def _best(starts, places, moves, series, objective, prior, tolerance) -> Estimat
             ::-1
         ],
     )
-
-
-def _check(model: Any, several: Sequence[TimeSeries]) -> None:
-    """Refuse what cannot be learnt, in one sentence."""
-    leaves = named_parameters(model)
-    if not leaves:
-        raise InputError("Nothing in the model learns: every number is known or `Frozen`. Wrap one in `Positive`.")
-    size = sum(int(np.size(getattr(leaf, "free", leaf))) for leaf in leaves.values())
-    if size > _MOST_PARAMETERS:
-        raise InputError(
-            f"{size} numbers learn, but `learn` is for at most {_MOST_PARAMETERS}: it keeps a square matrix of them."
-        )
-    _check_polynomial(model, several)
-    _check_steps(model, several)
-
-
-def _check_polynomial(model: Any, several: Sequence[TimeSeries]) -> None:
-    hamiltonian = polynomial_of(model)
-    if hamiltonian is None:
-        return
-    readings = sum(int(np.sum(~np.isnan(np.asarray(one.readings)))) for one in several)
-    if len(hamiltonian.terms) > readings > 0:
-        raise InputError(
-            f"A Hamiltonian of degree {hamiltonian.degree} has {len(hamiltonian.terms)} terms, but there are only "
-            f"{readings} readings; lower the degree."
-        )
-    initial = model.initial[0] if isinstance(model.initial, tuple) else model.initial
-    if initial is None:
-        state = several[0].readings.shape[1]
-    else:
-        state = jnp.shape(getattr(initial.mean, "value", initial.mean))[0]
-    if state != 2 * hamiltonian.dim:
-        raise InputError(
-            f"The Hamiltonian is of {hamiltonian.dim} degrees of freedom, so a phase point has {2 * hamiltonian.dim} "
-            f"numbers, but the state has {state}; make `dim` half of it."
-        )
-
-
-def _check_steps(model: Any, several: Sequence[TimeSeries]) -> None:
-    """Process noise per data interval has no meaning where the intervals differ."""
-    noise = getattr(model, "process_noise", None)
-    if not isinstance(noise, AdditiveGaussian) or not named_parameters(noise):
-        return
-    steps = np.concatenate([np.diff(one.times) for one in several])
-    if steps.max() > 1.01 * steps.min():
-        raise InputError(
-            f"The time step changes from {steps.min():.4g} to {steps.max():.4g}, but the variance of "
-            "`AdditiveGaussian` process noise is per data interval; use `WienerIncrement`, which is per unit time."
-        )

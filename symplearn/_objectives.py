@@ -11,7 +11,16 @@ from jaxtyping import Array, Float
 
 from ._errors import InputError
 from ._filter import Filtered, log_likelihood, unscented_filter
-from ._model import AbstractStateSpaceModel, FullState, Gaussian, Instant, Interval, intervals_between, slice_at
+from ._model import (
+    AbstractStateSpaceModel,
+    FullState,
+    Gaussian,
+    Instant,
+    Interval,
+    Propagator,
+    intervals_between,
+    slice_at,
+)
 from ._parameters import resolve
 from ._transforms import STANDARD, AbstractTransform, Taylor
 
@@ -142,6 +151,7 @@ def prepare(
     model, readings = resolve(model), series.readings
     intervals, instants = intervals_between(series.times, series.inputs), Instant(series.times, series.inputs)
     size = readings.shape[1] if model.initial is None else jnp.asarray(model.initial.mean).shape[0]
+    refuse_wrong_state(model, size)
     _check_channels(model, size, readings.shape[1], slice_at(instants, 0))
     if model.initial is None:
         given = _given_first(model, readings[0], slice_at(instants, 0))
@@ -152,6 +162,24 @@ def prepare(
 
 def _is_none(node: Any) -> bool:
     return node is None
+
+
+def refuse_wrong_state(model: Any, size: int) -> None:
+    """Refuses, with `InputError`, a state whose size is not that of the Hamiltonian's phase points."""
+    dynamics = getattr(model, "dynamics", None)
+    if not isinstance(dynamics, Propagator):
+        return
+    dim = getattr(getattr(dynamics.system, "hamiltonian", dynamics.system), "dim", None)
+    if isinstance(dim, int) and size != 2 * dim:
+        raise InputError(
+            f"The Hamiltonian is of {dim} degrees of freedom, so a phase point has {2 * dim} numbers, but the state "
+            f"has {size}; make `dim` half of it."
+        )
+    if size % 2:
+        raise InputError(
+            f"The size of the state is {size}, but a phase point has a momentum for each coordinate; where only some "
+            "are read, say so by `observation=Coordinates(...)` and give `initial=Gaussian(mean, covariance)` of all."
+        )
 
 
 def _check_channels(model: Any, state: int, channels: int, instant: Instant) -> None:

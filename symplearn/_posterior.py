@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 from ._arviz import arviz, inference_data
 from ._convergence import Diagnostics, diagnose_draws, labels
 from ._errors import InputError
-from ._fit import Estimate, negative_log_posterior
+from ._fit import Estimate
+from ._log_posterior import negative_log_posterior
 from ._model import AbstractStateSpaceModel
 from ._objectives import AbstractObjective, TimeSeries
 from ._parameters import flatten, named_parameters, resolve, value_of

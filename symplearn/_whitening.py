@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
-from ._fit import gradient
+from ._log_posterior import gradient
 
 # A width is measured where the log density has fallen by this: two standard deviations of a normal density.
 _DROP = 2.0

@@ -140,7 +140,7 @@ def test_the_same_structure_compiles_once():
     [
         (lambda m, r: (eqx.tree_at(lambda m: m.observation, m, Coordinates((0,))), r), "channels|initial"),
         (lambda m, r: (m, SimpleNamespace(times=r.times[::-1], readings=r.readings)), "strictly increasing"),
-        (lambda m, r: (m, SimpleNamespace(times=r.times, readings=r.readings[:, :1])), "has 1 channels"),
+        (lambda m, r: (m, SimpleNamespace(times=r.times, readings=r.readings[:, :1])), "size of the state is 1"),
         (lambda m, r: (m, SimpleNamespace(times=r.times[:1], readings=r.readings[:1])), "at least 2"),
         (lambda m, r: (m, SimpleNamespace(times=r.times, readings=np.full((N, 2), np.inf))), "infinite"),
         (lambda m, r: (pendulum(1e200), r), "no finite score at its start"),

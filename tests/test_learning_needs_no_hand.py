@@ -11,9 +11,9 @@ from scipy.stats import chi2
 import integrators as ig
 from symplearn._errors import InputError
 from symplearn._evidence import laplace_evidence
-from symplearn._fit import negative_log_posterior
 from symplearn._hamiltonians import Legendre, Polynomial, PolynomialPotential
 from symplearn._learn import learn
+from symplearn._log_posterior import negative_log_posterior
 from symplearn._model import Coordinates, FullState, Gaussian, Propagator, StateSpaceModel
 from symplearn._noise import AdditiveGaussian, Diagonal, LogVariance, ScaledIdentity, StandardDeviation, WienerIncrement
 from symplearn._objectives import MARGINAL_LIKELIHOOD, TimeSeries

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 import integrators as ig
-from symplearn._fit import negative_log_posterior
+from symplearn._log_posterior import negative_log_posterior
 from symplearn._model import Coordinates, FullState, Gaussian, LinearDynamics, Propagator, StateSpaceModel
 from symplearn._noise import AdditiveGaussian, Dense, ScaledIdentity
 from symplearn._objectives import MARGINAL_LIKELIHOOD, TimeSeries

@@ -113,6 +113,7 @@ def recorded(force, read, start, times, noise, seed=0):
     def slope(_, x):
         return np.concatenate([x[d:], force(x[:d])])
 
+    # SciPy's own error bounds, far below any noise of these readings.
     xs = solve_ivp(slope, times[[0, -1]], start, t_eval=times, method="DOP853", rtol=1e-10, atol=1e-10).y.T
     exact = np.array([read(x) for x in xs])
     return exact + noise * np.random.default_rng(seed).normal(size=exact.shape)

@@ -1,0 +1,49 @@
+"""The log posterior as a function of free coordinates that an optimiser can walk on."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._faults import IMPOSSIBLE
+from ._model import AbstractStateSpaceModel
+from ._objectives import AbstractObjective, TimeSeries
+from ._prior import Prior
+
+# Stands for an infinite score inside the optimiser, which can compare it but must not subtract infinities.
+HOPELESS = -IMPOSSIBLE
+# Up to this many parameters forward derivatives are the faster ones (performance.md).
+_FORWARD = 12
+
+
+def negative_log_posterior(
+    model: AbstractStateSpaceModel,
+    series: TimeSeries | tuple[TimeSeries, ...],
+    objective: AbstractObjective,
+    prior: Prior,
+) -> Float[Array, ""]:
+    """The score of the model plus minus the log prior density of its free coordinates, in nats."""
+    return objective(model, series) - prior.log_density(model)
+
+
+def gradient(score: Callable[[Array], Array], size: int) -> Callable[[Array], Array]:
+    """The gradient of a score of `size` parameters: forward for a few, reverse for many."""
+    return jax.jacfwd(score) if size <= _FORWARD else jax.grad(score)
+
+
+def guarded(score: Callable[[Array], Array], size: int) -> Callable[[Array], Array]:
+    """`score` with a large finite number for every non-finite one, and with derivatives that are never
+    NaN."""
+
+    @jax.custom_jvp
+    def safe(free):
+        value = score(free)
+        return jnp.where(jnp.isfinite(value), value, HOPELESS)
+
+    @safe.defjvp
+    def _(primals, tangents):
+        slope = gradient(score, size)(primals[0])
+        return safe(primals[0]), jnp.where(jnp.isfinite(slope), slope, 0.0) @ tangents[0]
+
+    return safe
