@@ -62,7 +62,7 @@ def descend(
     kinks: Float[Array, " parameter"],
     series: TimeSeries | tuple[TimeSeries, ...],
     objective: AbstractObjective,
-    prior: Prior,
+    prior: Prior | None,
     max_steps: Int[Array, ""],
     tolerance: Float[Array, ""],
 ) -> Place:

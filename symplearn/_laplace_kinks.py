@@ -22,7 +22,7 @@ class Task(NamedTuple):
 
     series: TimeSeries | tuple[TimeSeries, ...]
     objective: AbstractObjective
-    prior: Prior
+    prior: Prior | None
     kinks: Array
     tolerance: float
 

@@ -21,10 +21,12 @@ def negative_log_posterior(
     model: AbstractStateSpaceModel,
     series: TimeSeries | tuple[TimeSeries, ...],
     objective: AbstractObjective,
-    prior: Prior,
+    prior: Prior | None,
 ) -> Float[Array, ""]:
-    """The score of the model plus minus the log prior density of its free coordinates, in nats."""
-    return objective(model, series) - prior.log_density(model)
+    """The score of the model plus minus the log prior density of its free coordinates, in nats; without a prior the
+    score alone."""
+    score = objective(model, series)
+    return score if prior is None else score - prior.log_density(model)
 
 
 def gradient(score: Callable[[Array], Array], size: int) -> Callable[[Array], Array]:
