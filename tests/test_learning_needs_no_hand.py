@@ -21,8 +21,6 @@ from symplearn._parameters import Frozen, Learnt, Positive, flatten, resolve
 from symplearn._prior import Flat, HalfNormal, Laplace, Normal, Prior
 from symplearn._starts import harmonic, scales, with_variances
 
-pytestmark = pytest.mark.slow  # four minutes with its neighbours of issues 4 and 5
-
 # H = p^2/2 + 0.1 q + 0.6 q^2 + 0.25 q^3 + 0.4 q^4, read in q and p every 0.4 with noise of sd 0.02.
 TRUTH = np.array([0.1, 0.6, 0.25, 0.4])
 TIMES, SD = 0.4 * np.arange(26), 0.02
@@ -103,6 +101,7 @@ def test_a_coefficient_at_a_kink_is_zero_exactly():
     assert jnp.all(jax.jit(jax.vmap(score))(aside.reshape(-1, free.size)) > -estimate.log_posterior)
 
 
+@pytest.mark.slow
 def test_two_recordings_and_known_noise_and_legendre():
     """Several recordings, a known process noise, standard deviations and another basis are learnt without a hand."""
     model = StateSpaceModel(

@@ -47,6 +47,7 @@ def test_ninety_five_of_a_hundred():
     assert together >= 95
 
 
+@pytest.mark.slow
 def test_a_handful():
     """Four random starts on two recordings end in the best optimum known, which the truth as a start finds too."""
     rng = np.random.default_rng(1)
