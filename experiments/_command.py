@@ -59,7 +59,7 @@ def command(name: str, about: str, experiment: Callable[[Run], None], arguments:
     parser = _Parser(prog=f"experiments.{name}", description=about)
     parser.add_argument("--out", type=Path, default=Path("out") / name, help="folder to fill (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the noise, 0 or more (default: 0)")
-    parser.add_argument("--quick", action="store_true", help="a smaller run, of less than a minute")
+    parser.add_argument("--quick", action="store_true", help="a smaller run, of less than five minutes")
     run = Run(**vars(parser.parse_args(arguments)))
     if run.seed < 0:
         parser.error(f"--seed is {run.seed}, but must be 0 or more")

@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +18,8 @@ import integrators as ig
 from symplearn._checkpoint import Checkpoint, seal_of
 from symplearn._errors import printable
 from symplearn._train import Training, TrainingState, run_epochs
+
+from ._command import Run, command
 
 
 class Weighted(ig.AbstractProjection):
@@ -45,8 +48,9 @@ def side_by_side(jobs: Sequence[Callable[[], Any]], deadline: Deadline) -> list[
         try:
             return [each.result() for each in waiting]
         except BaseException:
-            # The others stop as well, and save where they are.
+            # The others stop as well, and save where they are; those that wait do not begin.
             deadline.moment = -math.inf
+            pool.shutdown(wait=False, cancel_futures=True)
             raise
 
 
@@ -89,6 +93,64 @@ def _best(ensemble: Ensemble, state: TrainingState) -> Any:
         return ensemble.training.best(model, ensemble.training.finish(model, recording, state))
 
     return eqx.filter_vmap(one)(ensemble.models, ensemble.recordings, state)
+
+
+class Spread(NamedTuple):
+    """The median and the 10 % and 90 % quantiles over repeats, which are NumPy's linearly interpolated ones."""
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: Any) -> "Spread":
+        low, middle, high = np.quantile(np.asarray(values), (0.1, 0.5, 0.9))
+        return cls(float(middle), float(low), float(high))
+
+    def __str__(self) -> str:
+        return f"{self.median:.3g} [{self.low:.3g}, {self.high:.3g}]"
+
+    @property
+    def verdict(self) -> str:
+        """Of how many times an error fell: whether more than nine of ten repeats agree."""
+        return "it helps" if self.low > 1.0 else "it hurts" if self.high < 1.0 else "it makes no clear difference"
+
+
+def plain(metrics: dict[str, Any]) -> dict[str, Any]:
+    """Metrics for JSON: a spread is an object with `median`, `low` and `high`."""
+    return {name: one._asdict() if isinstance(one, Spread) else one for name, one in metrics.items()}
+
+
+def smaller(settings: Any, full: Any, **counts: tuple[int, int]) -> str:
+    """The first line of a study that is smaller than the published one; empty where it is not.
+
+    Of each setting that is a number, and of `counts`, it says how much of how much.
+    """
+    if settings == full:
+        return ""
+    numbers = {name: (each, getattr(full, name)) for name, each in settings._asdict().items() if isinstance(each, int)}
+    parts = [f"{name} {own} of {whole}" for name, (own, whole) in (counts | numbers).items() if own != whole]
+    return f"SMALLER than the published study: {', '.join(parts)}. No number is the full run's.\n"
+
+
+def study_command(
+    name: str, about: str, experiment: Callable[[Any, Deadline, Run], None], sizes: Callable[[bool], Any], given: Any
+) -> None:
+    """The command line of a study: `sizes(quick)` are its settings, `given` the arguments, or None for the process's.
+
+    Ctrl-C ends with exit code 130, and the same command goes on from there.
+    """
+    deadline, chosen_sizes, others = options(name, sys.argv[1:] if given is None else given)
+
+    def chosen(run: Run) -> None:
+        try:
+            experiment(sizes(run.quick)._replace(**chosen_sizes), deadline, run)
+        except KeyboardInterrupt:
+            print(f"experiments.{name}: stopped; the same command goes on from here", file=sys.stderr)
+            raise SystemExit(130) from None
+
+    more = "--minutes M stops in time; --width, --epochs and --repeats make it smaller."
+    command(name, f"{about} {more}", chosen, others)
 
 
 # The rates fall 20 times, so there are at least so many epochs.

@@ -1,5 +1,6 @@
 """The figures of `henon_heiles`: the dissertation's 5.1 to 5.4 for one realisation, and the spread over all."""
 
+from collections.abc import Sized
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,12 +9,11 @@ from matplotlib.figure import Figure
 
 from symplearn._objectives import TimeSeries
 
-COLOURS = {"symplectic": "tab:blue", "rk2": "tab:red", "heun": "tab:orange", "order4_step_5_times_larger": "tab:green"}
+COLOURS = {"symplectic": "tab:blue", "rk2": "tab:red", "order8_step_5_times_larger": "tab:green"}
 NAMES = {
     "symplectic": "leapfrog",
     "rk2": "Runge-Kutta 2",
-    "heun": "Heun",
-    "order4_step_5_times_larger": "order 4,\n5 times the step",
+    "order8_step_5_times_larger": "order 8,\n5 times the step",
 }
 
 
@@ -63,16 +63,17 @@ def hamiltonians(times: np.ndarray, views: list[View], true: float, until: float
         stepped.plot(view.steps, view.as_learnt, color=colour, label=f"{name}, stepped as it was learnt")
     for panel in (levels, stepped):
         panel.axhline(true, color="black", ls="--", label="truth")
-        panel.axvline(until, color="magenta", lw=1)
         panel.set(xlabel="t (s)", ylabel="H")
+    levels.axvline(until, color="magenta", lw=1, label="last reading")
     levels.set_title("(a) learnt energy, kept by leapfrog in fine steps")
     stepped.set_title("(b) the same models in the steps they were learnt in")
-    top = np.quantile(np.concatenate([view.as_learnt for view in views]), 0.98)
+    levelled = np.concatenate([view.as_learnt for view in views])
+    top = np.quantile(levelled[np.isfinite(levelled)], 0.98)  # Runge-Kutta's may leave the finite numbers
     stepped.set_ylim(0.9 * true, max(1.5 * true, 1.1 * top))
     stepped.legend(loc="upper left")
     low, high = levels.get_ylim()
     levels.set_ylim(low, high + 0.5 * (high - low))  # room for the legend
-    levels.legend(loc="upper left", ncols=2)
+    levels.legend(loc="upper left", ncols=2, framealpha=1.0)
     return figure
 
 
@@ -88,14 +89,14 @@ def trajectories(times: np.ndarray, true: np.ndarray, views: list[View], series:
         panel.plot(times, view.path[:, 0], color=colour, lw=1.4, label="MAP")
         panel.plot(times, true[:, 0], color="black", lw=1.0, ls="--", label="truth")
         panel.plot(series.times, readings[:, 0], ".", color="tab:purple", ms=7, label="readings")
-        panel.axvline(until, color="magenta", lw=1)
+        panel.axvline(until, color="magenta", lw=1, label="last reading")
         panel.axvline(view.tracked, color="grey", lw=1, ls=":")
-        panel.set(ylabel="q1", ylim=(-1.0, 1.0), xlim=(0, times[-1]))
+        panel.set(ylabel="q1", ylim=(-0.95, 0.7), xlim=(0, times[-1]))
         panel.set_title(
             f"learnt with {NAMES[view.name]}; error above a fifth of the amplitude from {view.tracked:.1f} s"
         )
     panel.set_xlabel("t (s)")
-    panel.legend(loc="lower left", ncols=4)
+    panel.legend(loc="lower left", ncols=5, framealpha=1.0)
     return figure
 
 
@@ -121,7 +122,12 @@ def spreads(results: dict[str, list[dict[str, Any]]], true: float, published: di
     energy.axhline(true, color="black", ls="--", lw=1, label="truth")
     energy.legend()
     _dots(tracking, results, "tracking_time", published)
-    tracking.legend()
+    for place, runs in enumerate(results.values()):
+        values = [one["tracking_time_stepped_as_learnt"] for one in runs]
+        label = None if place else "in the steps of learning"
+        tracking.plot(_aside(place, values), values, "x", color="grey", ms=4, label=label)
+    tracking.set_ylim(0, 260)  # room for the legend
+    tracking.legend(loc="upper right")
     _dots(noise, results, "process_noise_median", {})
     noise.set_yscale("log")
     energy.set(title="learnt energy H")
@@ -134,10 +140,14 @@ def _dots(panel: Axes, results: dict[str, list[dict[str, Any]]], key: str, publi
     """A dot for each realisation, a bar at the median, a star at the published number."""
     for place, (name, runs) in enumerate(results.items()):
         values = np.array([one[key] for one in runs])
-        aside = place + np.linspace(-0.2, 0.2, len(values))
-        panel.plot(aside, values, "o", color=COLOURS[name], alpha=0.6, ms=5)
+        panel.plot(_aside(place, values), values, "o", color=COLOURS[name], alpha=0.6, ms=5)
         panel.plot([place - 0.3, place + 0.3], [np.median(values)] * 2, color=COLOURS[name], lw=2)
         if f"{key}_{name}" in published:
             label = None if "published" in panel.get_legend_handles_labels()[1] else "published"
             panel.plot(place, published[f"{key}_{name}"], "*", color="black", ms=11, label=label)
     panel.set_xticks(range(len(results)), [NAMES[name] for name in results])
+
+
+def _aside(place: int, values: Sized) -> np.ndarray:
+    """Abscissae side by side around a place."""
+    return place + np.linspace(-0.2, 0.2, len(values))

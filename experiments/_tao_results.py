@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ._command import print_table
+from ._ensemble import Spread
 
 POSTERIOR, L1, MEAN = WAYS = ("posterior", "l1", "posterior_mean_of_copies")
 NOISES, COUNTS = tuple(round(0.01 * i, 2) for i in range(11)), tuple(range(300, 1001, 100))
@@ -58,6 +59,8 @@ _MAPPED = {
     "mse_low": lambda one: np.quantile(one.mse, 0.1),
     "mse_high": lambda one: np.quantile(one.mse, 0.9),
     "hamiltonian_mse_median": lambda one: np.median(one.off),
+    "hamiltonian_mse_low": lambda one: np.quantile(one.off, 0.1),
+    "hamiltonian_mse_high": lambda one: np.quantile(one.off, 0.9),
     "hamiltonian_mse_minimum": lambda one: one.off.min(),
     "hamiltonian_mse_of_minimum_mse": lambda one: one.of_least,
 }
@@ -73,13 +76,16 @@ def grid(found: Outcomes, way: str, value: Any) -> np.ndarray:
 
 
 def metrics(found: Outcomes, cells: Sequence[Cell]) -> dict[str, Any]:
-    """The keys of `metrics.json`; null in a map is a data set that was not asked for, or is in `missing`."""
+    """The keys of `metrics.json`; null in a map is a data set that was not asked for, or is in `missing`.
+
+    A gain is how many times lower an error of the likelihood is than that of L1, or of `beyond` than of the likelihood.
+    """
     numbers: dict[str, Any] = {"noises": NOISES, "counts": COUNTS}
+    done = [cell for cell in cells if (L1, cell) in found]
     for way in (POSTERIOR, L1):
         for name, value in _MAPPED.items():
-            table = grid(found, way, value)
+            table = grid({key: one for key, one in found.items() if key[1] in done}, way, value)
             numbers[f"{name}_{way}"] = np.where(np.isnan(table), None, table).tolist()
-    done = [cell for cell in cells if (L1, cell) in found]
     numbers |= {"cells": len(done), "missing": [list(cell) for cell in cells if cell not in done]}
     pairs = [(found[POSTERIOR, cell], found[L1, cell]) for cell in done]
     numbers["cells_won_median"] = sum(bool(np.median(p.mse) < np.median(o.mse)) for p, o in pairs)
@@ -87,33 +93,44 @@ def metrics(found: Outcomes, cells: Sequence[Cell]) -> dict[str, Any]:
     gains = [o.of_least / p.of_least for p, o in pairs]
     middle = [float(np.median(o.off) / np.median(p.off)) for p, o in pairs]
     numbers["best_gain_hamiltonian_mse"] = max(gains, default=None)
-    numbers["gain_hamiltonian_mse"] = _spread(gains)
-    numbers["gain_hamiltonian_mse_medians"] = _spread(middle)
-    numbers["beyond_mean_of_copies"] = [_beyond(found, cell) for way, cell in found if way == MEAN]
-    numbers["published"] = {"best_gain_hamiltonian_mse": PUBLISHED_GAIN, "cells_won": PUBLISHED_WON}
-    return numbers
+    numbers["gain_hamiltonian_mse"] = _over_cells(gains)
+    numbers["gain_hamiltonian_mse_medians"] = _over_cells(middle)
+    numbers["published_best_gain_hamiltonian_mse"] = PUBLISHED_GAIN
+    return numbers | _mean_of_copies(found) | _noisier(found)
 
 
-def _spread(values: Sequence[float]) -> dict[str, float] | None:
-    """Over the data sets."""
-    if not values:
-        return None
-    low, middle, high = np.quantile(values, (0.1, 0.5, 0.9))
-    return {"median": float(middle), "low": float(low), "high": float(high)}
+def _over_cells(values: Sequence[float]) -> Spread | None:
+    return Spread.of(values) if len(values) else None
 
 
-def _beyond(found: Outcomes, cell: Cell) -> dict[str, Any]:
-    """Mean of copies against first copy in the filter; the ratios are of errors, repeat by repeat, below 1 where it
-    helps."""
-    mean, first = found[MEAN, cell], found[POSTERIOR, cell]
-    return {
-        "a": cell[0],
-        "n": cell[1],
-        "mse_ratio": _spread(list(mean.mse / first.mse)),
-        "hamiltonian_mse_ratio": _spread(list(mean.off / first.off)),
-        "mse_median": float(np.median(mean.mse)),
-        "hamiltonian_mse_median": float(np.median(mean.off)),
-    }
+def _mean_of_copies(found: Outcomes) -> dict[str, Any]:
+    """Mean of copies against first copy in the filter, repeat by repeat."""
+    parts, every = [], []
+    for way, cell in found:
+        if way != MEAN:
+            continue
+        mean, first = found[MEAN, cell], found[POSTERIOR, cell]
+        gain = {"mse": first.mse / mean.mse, "hamiltonian_mse": first.off / mean.off}
+        every.append(gain["hamiltonian_mse"])
+        parts.append({"a": cell[0], "n": cell[1]} | {f"gain_{k}": Spread.of(v)._asdict() for k, v in gain.items()})
+    together = Spread.of(np.concatenate(every)) if every else None
+    return {"beyond_mean_of_copies": parts, "beyond_mean_of_copies_gain_hamiltonian_mse": together}
+
+
+def _noisier(found: Outcomes) -> dict[str, Any]:
+    """The likelihood at a = 10 % against L1 at 1 %, of each n for which both are done."""
+    pairs = [(n, found.get((POSTERIOR, (0.1, n))), found.get((L1, (0.01, n)))) for n in COUNTS]
+    parts = [
+        {
+            "n": n,
+            "gain_mse": float(np.median(quiet.mse) / np.median(noisy.mse)),
+            "gain_hamiltonian_mse": float(np.median(quiet.off) / np.median(noisy.off)),
+        }
+        for n, noisy, quiet in pairs
+        if noisy is not None and quiet is not None
+    ]
+    won = sum(part["gain_mse"] > 1.0 for part in parts)
+    return {"beyond_noise_ten_times": parts, "beyond_noise_ten_times_won": won}
 
 
 def show(found: Outcomes, numbers: dict[str, Any]) -> None:
@@ -130,6 +147,17 @@ def show(found: Outcomes, numbers: dict[str, Any]) -> None:
     gain = numbers["best_gain_hamiltonian_mse"]
     if gain is not None:
         print(f"best gain in Hamiltonian MSE: {gain:.4g} (published: up to {PUBLISHED_GAIN:g})")
+        print(f"gain in Hamiltonian MSE over the data sets: {numbers['gain_hamiltonian_mse']}")
+    together, noisier = numbers["beyond_mean_of_copies_gain_hamiltonian_mse"], numbers["beyond_noise_ten_times"]
+    if together is not None:
+        where = f"{len(numbers['beyond_mean_of_copies'])} data sets"
+        print(f"beyond, mean of copies in the filter: Hamiltonian MSE falls {together} times ({where}): ", end="")
+        print(together.verdict)
+    if noisier:
+        each = ", ".join(f"{part['gain_mse']:.3g} at n = {part['n']}" for part in noisier)
+        won = f"in {numbers['beyond_noise_ten_times_won']} of {len(noisier)}"
+        print(f"beyond, noise ten times larger: median MSE of L1 at 1 % over the posterior's at 10 %: {each}; ", end="")
+        print(f"the posterior bears ten times the noise at no more error {won}")
 
 
 def maps(found: Outcomes) -> Figure:

@@ -7,12 +7,11 @@ Masses and lengths 1, 2000 readings every 0.01 with noise v ~ U[0.99, 1.01] time
 motion is regular (specification E48), from q1 = 2 chaotic. Both, and all repeats, are one program; `--minutes` stops it
 in time, and the same command goes on from there. Truth by SciPy's DOP853.
 
-Beyond the dissertation: pieces of the recording filtered side by side, each given its first reading, a few at a time:
-many steps of Adam for the price of one, and a program as short as one piece.
+Beyond the dissertation: a learning step 5 times larger, on every fifth reading; and pieces of the recording filtered
+side by side, each given its first reading, a few at a time: many steps of Adam for the price of one.
 """
 
 import math
-import sys
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -22,7 +21,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
 import integrators as ig
@@ -37,15 +35,16 @@ from symplearn._parameters import Positive, resolve
 from symplearn._prior import Flat, HalfNormal, Prior
 from symplearn._train import Training
 
-from ._command import Run, command, print_table
-from ._ensemble import Deadline, Ensemble, options, side_by_side
+from . import _double_pendulum_results as found
+from ._command import Run
+from ._double_pendulum_results import COARSE, GRAVITY, L1, POSTERIOR, STEP, WAYS
+from ._ensemble import Deadline, Ensemble, plain, side_by_side, smaller, study_command
 
-STEP, OMEGA, NOISE, GRAVITY = 0.01, 20.0, 0.01, 9.81
+OMEGA, NOISE = 20.0, 0.01
 STARTS = {"regular": (1.0, 0.0, 0.0, 0.0), "chaotic": (2.0, 0.0, 0.0, 0.0)}
-POSTERIOR, L1, PIECES = WAYS = ("posterior", "l1", "posterior_in_pieces")
-COLOURS = dict(zip(WAYS, ("tab:blue", "tab:red", "tab:green"), strict=True))
 CERTAIN, JITTER = 1e-8, 1e-10
-FAR, DRAWS = 0.5, 100  # radians; paths of the stochastic simulation
+SPARSE = 5  # readings in one of the larger learning step's intervals
+DRAWS = 100  # paths of the stochastic simulation
 
 
 class Settings(NamedTuple):
@@ -60,7 +59,7 @@ class Settings(NamedTuple):
 
 
 FULL = Settings(2000, 20, 64, 1000, 50)
-QUICK = Settings(500, 5, 16, 150, 25)
+QUICK = Settings(500, 5, 16, 120, 25)
 
 
 class InPieces(AbstractObjective):
@@ -82,13 +81,6 @@ class InPieces(AbstractObjective):
         free = eqx.tree_at(lambda m: m.initial, model, None)
         scores = jax.vmap(lambda t, y: MARGINAL_LIKELIHOOD.score(free, TimeSeries(t, y)))
         return weight * jnp.sum(scores(series.times[places], series.readings[places]))
-
-
-def energy(x: np.ndarray) -> np.ndarray:
-    """H (5.28) over the last axis, with the denominator of specification E46."""
-    a, b, p, r = np.moveaxis(x, -1, 0)
-    kinetic = (p**2 + 2 * r**2 - 2 * p * r * np.cos(a - b)) / (2 * (1 + np.sin(a - b) ** 2))
-    return kinetic - GRAVITY * (2 * np.cos(a) + np.cos(b))
 
 
 def orbit(start: Sequence[float], count: int) -> np.ndarray:
@@ -140,7 +132,7 @@ def training_of(settings: Settings, way: str) -> Training:
         return Training(OneStepL1(1.0, batch), Prior(Flat()), network, math.ceil(intervals / batch.size))
     both = ByLeaf({"": network, "process_noise": Adam(1.0, decay, 0.8, betas=(0.1, 0.1))})
     prior = Prior({"dynamics": Flat(), "process_noise": HalfNormal(1e-12)})
-    if way == POSTERIOR:
+    if way in (POSTERIOR, COARSE):
         return Training(MARGINAL_LIKELIHOOD, prior, both)
     size = settings.piece * max(1, settings.batch // settings.piece // 2)
     pieces = InPieces(settings.piece, MiniBatch(min(size, intervals // settings.piece * settings.piece), nothing))
@@ -157,7 +149,8 @@ def study(settings: Settings, run: Run, deadline: Deadline) -> dict[str, Any]:
 
     def best(way: str) -> Any | None:
         models = _models(keys, starts, settings.width, way != L1)
-        ensemble = Ensemble(training_of(settings, way), models, series, keys, settings.epochs)
+        kept = TimeSeries(series.times[:, ::SPARSE], series.readings[:, ::SPARSE]) if way == COARSE else series
+        ensemble = Ensemble(training_of(settings, way), models, kept, keys, settings.epochs)
         return ensemble.run(way, folder / f"{way}.npz", deadline)
 
     found = side_by_side([partial(best, way) for way in WAYS], deadline)
@@ -176,138 +169,80 @@ def _simulated(models: Any, count: int) -> Array:
 
 
 @eqx.filter_jit
-def _drawn(models: Any, count: int, key: Array) -> Array:
-    """Angles (row, draw, count, 2) of stochastic simulations: free runs with the learnt process noise."""
+def _learnt(models: Any) -> Array:
+    """The variances (row, 4) of the process noise."""
+    return eqx.filter_vmap(lambda model: jnp.square(jnp.diagonal(resolve(model).process_noise.structure.root)))(models)
 
-    def one(model: StateSpaceModel, key: Array) -> Array:
-        model = resolve(model)
-        root, start = model.process_noise.structure.root, model.initial.mean
+
+@eqx.filter_jit
+def _errors(models: Any, truth: Array) -> Array:
+    """One-step errors (row, time, 4) from true states (row, time, 4)."""
+    interval = Interval(jnp.zeros(()), jnp.asarray(STEP))
+
+    def one(model: StateSpaceModel, xs: Array) -> Array:
+        return jax.vmap(lambda x: resolve(model).dynamics(x, interval))(xs[:-1]) - xs[1:]
+
+    return eqx.filter_vmap(one)(models, truth)
+
+
+@eqx.filter_jit
+def _drawn(models: Any, variances: Array, count: int, key: Array) -> Array:
+    """Angles (row, draw, count, 2) of stochastic simulations: free runs with process noise of these variances."""
+
+    def one(model: StateSpaceModel, sd: Array, key: Array) -> Array:
+        model, start = resolve(model), model.initial.mean
 
         def step(x: Array, xi: Array) -> tuple[Array, Array]:
-            after = model.dynamics(x, Interval(jnp.zeros(()), jnp.asarray(STEP))) + root @ xi
+            after = model.dynamics(x, Interval(jnp.zeros(()), jnp.asarray(STEP))) + sd * xi
             return after, after[:2]
 
         later = jax.lax.scan(step, start, jax.random.normal(key, (count - 1, 4)))[1]
         return jnp.concatenate([start[None, :2], later])
 
-    def row(model: StateSpaceModel, key: Array) -> Array:
-        return jax.vmap(lambda key: one(model, key))(jax.random.split(key, DRAWS))
+    def row(model: StateSpaceModel, sd: Array, key: Array) -> Array:
+        return jax.vmap(lambda key: one(model, sd, key))(jax.random.split(key, DRAWS))
 
-    return eqx.filter_vmap(row)(models, jax.random.split(key, jax.tree.leaves(models)[0].shape[0]))
-
-
-def spread(values: np.ndarray) -> dict[str, float]:
-    """Median and the 10 % and 90 % quantiles over the repeats."""
-    low, middle, high = np.quantile(values, (0.1, 0.5, 0.9))
-    return {"median": float(middle), "low": float(low), "high": float(high)}
+    return eqx.filter_vmap(row)(models, jnp.sqrt(variances), jax.random.split(key, len(variances)))
 
 
-def judge(xs: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
-    """Of all repeats (5.29), its maximum, and the time until an angle is off by half a radian."""
-    off = np.abs(energy(xs) - energy(truth[0]))
-    far = np.any(np.abs(xs[..., :2] - truth[:, :2]) > FAR, axis=-1)
-    until = STEP * np.where(far.any(axis=1), far.argmax(axis=1), len(truth))
-    return {
-        "mean_hamiltonian_error": spread(off.mean(axis=1)),
-        "maximum_hamiltonian_error": spread(off.max(axis=1)),
-        "time_to_half_radian": spread(until),
-    }
-
-
-def calibrate(draws: np.ndarray, xs: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
-    """The spread of the stochastic simulation against the true error of the free run, over the time of the data.
-
-    `coverage_90` is the share of angles inside the middle 90 % of the draws, `error_over_spread` the median over time
-    of |error| / standard deviation (0.67 for a normal), `rank_correlation` that of the two over time (Spearman).
-    """
-    half = len(truth) // 2
-    draws, angles, nominal = draws[:, :, :half], truth[:half, :2], xs[:, :half, :2]
-    low, high = np.quantile(draws, (0.05, 0.95), axis=1)
-    error = np.abs(nominal - angles).mean(axis=-1)[:, 1:]
-    sd = draws.std(axis=1).mean(axis=-1)[:, 1:]
-    ranks = [np.argsort(np.argsort(each, axis=1), axis=1) for each in (error, sd)]
-    return {
-        "coverage_90": spread(np.mean((low <= angles) & (angles <= high), axis=(1, 2))),
-        "error_over_spread": spread(np.median(error / np.maximum(sd, 1e-12), axis=1)),
-        "rank_correlation": spread(np.array([np.corrcoef(*pair)[0, 1] for pair in zip(*ranks, strict=True)])),
-    }
-
-
-class Drawing(NamedTuple):
-    """What a figure shows of one regime: truth, free runs of each way, and draws, all of one repeat."""
-
-    truth: np.ndarray
-    runs: dict[str, np.ndarray]
-    draws: np.ndarray | None
-
-
-def draw(drawings: dict[str, Drawing]) -> Figure:
-    """Figures 5.12 and 5.13 (angles in time, with the draws) and 5.14 (the absolute Hamiltonian error)."""
-    figure = Figure(figsize=(15.0, 3.6 * len(drawings)), layout="constrained")
-    panels = figure.subplots(len(drawings), 3, squeeze=False)
-    for row, (regime, (truth, runs, draws)) in zip(panels, drawings.items(), strict=True):
-        times = STEP * np.arange(len(truth))
-        for i in (0, 1):
-            if draws is not None:
-                row[i].plot(times, draws[:30, :, i].T, color="tab:blue", alpha=0.08, linewidth=0.6)
-            row[i].plot(times, truth[:, i], color="0.3", linewidth=2.0, label="truth")
-            for way, xs in runs.items():
-                row[i].plot(times, xs[:, i], color=COLOURS[way], linewidth=1.0, label=way)
-            row[i].axvline(times[len(times) // 2], color="0.8", linewidth=1.0)
-            limit = 1.5 * np.abs(truth[:, i]).max()
-            row[i].set(title=f"{regime}: q{i + 1}; data end at the line", xlabel="time", ylim=(-limit, limit))
-        for way, xs in runs.items():
-            row[2].semilogy(times, np.abs(energy(xs) - energy(truth[0])).clip(1e-6), color=COLOURS[way], label=way)
-        row[2].set(title=f"{regime}: absolute Hamiltonian error", xlabel="time")
-        row[2].legend(fontsize=8)
-    return figure
+def stochastic(models: Any, truth: np.ndarray, seed: int) -> found.Drawn:
+    """Stochastic simulations of the models over the true states (row, time, 4) of the time of the data."""
+    variances, errors = _learnt(models), _errors(models, jnp.asarray(truth))
+    key, count = jax.random.key(seed), truth.shape[1]
+    draws = [_drawn(models, each, count, key) for each in (variances, jnp.mean(errors**2, axis=1))]
+    return found.Drawn(*map(np.asarray, (*draws, errors, variances)))
 
 
 def experiment(settings: Settings, deadline: Deadline, run: Run) -> None:
-    """Train and judge, print the table, write metrics and the figure of what is done."""
-    if settings != FULL:
-        print(
-            f"SMALLER: {settings.count} of {FULL.count} readings, {settings.repeats} of {FULL.repeats} repeats, width "
-            f"{settings.width} of {FULL.width}, {settings.epochs} of {FULL.epochs} epochs: no number is the full run's."
-        )
+    """Train and judge, print the table, write metrics and the figures of what is done."""
+    print(smaller(settings, FULL), flush=True)
     best, size = study(settings, run, deadline), 2 * settings.count
     xs = {way: np.asarray(_simulated(models, size)) for way, models in best.items()}
-    draws = np.asarray(_drawn(best[POSTERIOR], size, jax.random.key(run.seed))) if POSTERIOR in best else None
-    metrics: dict[str, Any] = {}
-    drawings, rows = {}, []
-    for i, (regime, start) in enumerate(STARTS.items()):
-        own, truth = slice(i * settings.repeats, (i + 1) * settings.repeats), orbit(start, size)
-        metrics[regime] = {way: judge(all_xs[own], truth) for way, all_xs in xs.items()}
-        rows += [(regime, way, *(each["median"] for each in found.values())) for way, found in metrics[regime].items()]
-        if draws is None:
-            continue
-        metrics[regime]["calibration"] = calibrate(draws[own], xs[POSTERIOR][own], truth)
-        # The repeat in the middle of the posterior's Hamiltonian errors is drawn.
-        off = np.abs(energy(xs[POSTERIOR][own]) - energy(truth[0])).mean(axis=1)
-        one = int(np.argsort(off)[len(off) // 2])
-        drawings[regime] = Drawing(truth, {way: all_xs[own][one] for way, all_xs in xs.items()}, draws[own][one])
-    print_table(("motion", "way", "mean |H error|", "largest", "time to 0.5 rad"), *rows)
-    for regime, found in metrics.items() if draws is not None else ():
-        print(f"{regime}: spread against error:", {k: round(v["median"], 3) for k, v in found["calibration"].items()})
+    truth = {name: orbit(start, size) for name, start in STARTS.items()}
+    drawn = None
+    if POSTERIOR in best:
+        rows = np.repeat(np.array(list(truth.values())), settings.repeats, axis=0)[:, : settings.count]
+        drawn = stochastic(best[POSTERIOR], rows, run.seed)
+    regimes = {}
+    for i, name in enumerate(STARTS):
+        own = slice(i * settings.repeats, (i + 1) * settings.repeats)
+        draws = None if drawn is None else found.Drawn(*(each[own] for each in drawn))
+        regimes[name] = found.Regime(truth[name], {way: each[own] for way, each in xs.items()}, draws)
+    numbers = found.metrics(regimes)
+    found.show(regimes, numbers)
     missing = [way for way in WAYS if way not in best]
-    run.write(metrics | {"missing": missing, "settings": settings._asdict()})
-    if drawings:
-        run.save(draw(drawings), "double_pendulum.png")
+    run.write(plain(numbers) | {"missing": missing, "settings": settings._asdict()})
+    if POSTERIOR in best:
+        run.save(found.draw(regimes), "double_pendulum.png")
+        run.save(found.phase(regimes), "double_pendulum_phase.png")
     if missing:
         print(f"out of time: {', '.join(missing)} not done; the same command goes on from here")
 
 
 def main(arguments: Sequence[str] | None = None, settings: Settings | None = None) -> None:
     """The command line; `settings` are others than those of the options."""
-    deadline, sizes, others = options("double_pendulum", sys.argv[1:] if arguments is None else arguments)
-
-    def chosen(run: Run) -> None:
-        experiment((settings or (QUICK if run.quick else FULL))._replace(**sizes), deadline, run)
-
-    about = (
-        "Learn the double pendulum by likelihood and by L1. --minutes M stops in time; --width, --epochs, --repeats."
-    )
-    command("double_pendulum", about, chosen, others)
+    about = "Learn the double pendulum by likelihood and by L1."
+    study_command("double_pendulum", about, experiment, lambda quick: settings or (QUICK if quick else FULL), arguments)
 
 
 if __name__ == "__main__":

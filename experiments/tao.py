@@ -7,12 +7,12 @@ each: new weights, batches and noise, the same for both objectives. Truth by Sci
 program; on a GPU the likelihood of all n is. `--minutes` stops in time; the same command again goes on from there.
 
 Beyond the dissertation: the same likelihood with the mean of Tao's two copies in the filter, not the first copy, which
-is nearly symplectic (specification E40); at the corners and the centre of the grid.
+is nearly symplectic (specification E40), at the corners and the centre of the grid; and the likelihood on data with ten
+times the noise of those given to L1.
 """
 
 import itertools
 import math
-import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -39,8 +39,8 @@ from symplearn._prior import Flat, HalfNormal, Prior
 from symplearn._train import Training
 
 from . import _tao_results as found
-from ._command import Run, command
-from ._ensemble import Deadline, Ensemble, Weighted, options, side_by_side
+from ._command import Run
+from ._ensemble import Deadline, Ensemble, Weighted, plain, side_by_side, smaller, study_command
 from ._tao_results import COUNTS, L1, MEAN, NOISES, POSTERIOR, WAYS, Cell, Judged
 
 STEP, OMEGA, START = 0.01, 20.0, np.array([0.0, -3.0])
@@ -50,10 +50,11 @@ CERTAIN, JITTER = 1e-8, 1e-10
 
 
 class Settings(NamedTuple):
-    """What is trained: the data sets (a, n), those for the mean of copies too, and how."""
+    """What is trained: the data sets (a, n), those for the mean of copies too, those for L1 alone, and how."""
 
     cells: tuple[Cell, ...]
     beyond: tuple[Cell, ...]
+    quiet: tuple[Cell, ...]
     repeats: int
     width: int
     epochs: int
@@ -70,7 +71,8 @@ class Settings(NamedTuple):
 
     def of(self, way: str) -> tuple[Cell, ...]:
         """The data sets of one way."""
-        return self.beyond if way == MEAN else self.cells
+        others = {POSTERIOR: self.cells, L1: (*self.cells, *self.quiet), MEAN: self.beyond}
+        return others[way]
 
 
 class Row(NamedTuple):
@@ -81,8 +83,8 @@ class Row(NamedTuple):
     repeat: int
 
 
-FULL = Settings(tuple(itertools.product(NOISES, COUNTS)), (*CORNERS, (0.05, 600)), 20, 64, 400)
-QUICK = Settings((*CORNERS, (0.05, 600)), ((0.05, 600),), 5, 16, 200)
+FULL = Settings(tuple(itertools.product(NOISES, COUNTS)), (*CORNERS, (0.05, 600)), (), 20, 64, 400)
+QUICK = Settings((*CORNERS, (0.05, 600)), ((0.05, 600),), ((0.01, 300), (0.01, 1000)), 5, 16, 160)
 
 
 def energy(x: np.ndarray) -> np.ndarray:
@@ -235,17 +237,12 @@ def _train(settings: Settings, group: list[int], seed: int, folder: Path, seal: 
 
 def experiment(settings: Settings, deadline: Deadline, run: Run) -> None:
     """Train and judge, print the table, write metrics and figures of what is done."""
-    if settings != FULL:
-        print(
-            f"SMALLER: {len(settings.cells)} of {len(FULL.cells)} data sets, {settings.repeats} of {FULL.repeats} "
-            f"repeats, width {settings.width} of {FULL.width}, {settings.epochs} of {FULL.epochs} epochs: "
-            "no number is the full run's.\n"
-        )
+    print(smaller(settings, FULL, data_sets=(len(settings.cells), len(FULL.cells))), flush=True)
     done = found.outcomes({way: settings.of(way) for way in WAYS}, study(settings, run, deadline))
     numbers = found.metrics(done, settings.cells)
     found.show(done, numbers)
     said = {"repeats": settings.repeats, "width": settings.width, "epochs": settings.epochs}
-    run.write(numbers | {"settings": said})
+    run.write(plain(numbers) | {"settings": said})
     run.save(found.maps(done), "maps.png")
     corners = [
         cell for cell in (CORNERS if set(CORNERS) <= set(settings.cells) else settings.cells) if (L1, cell) in done
@@ -260,13 +257,8 @@ def experiment(settings: Settings, deadline: Deadline, run: Run) -> None:
 
 def main(arguments: Sequence[str] | None = None, settings: Settings | None = None) -> None:
     """The command line; `settings` are others than those of the options."""
-    deadline, sizes, others = options("tao", sys.argv[1:] if arguments is None else arguments)
-
-    def chosen(run: Run) -> None:
-        experiment((settings or (QUICK if run.quick else FULL))._replace(**sizes), deadline, run)
-
-    about = "Learn Tao's example by likelihood and by L1. --minutes M stops in time; --width, --epochs, --repeats."
-    command("tao", about, chosen, others)
+    about = "Learn Tao's example by likelihood and by L1."
+    study_command("tao", about, experiment, lambda quick: settings or (QUICK if quick else FULL), arguments)
 
 
 if __name__ == "__main__":

@@ -41,6 +41,8 @@ from ._hamiltonians import Polynomial as Polynomial
 from ._hamiltonians import PolynomialPotential as PolynomialPotential
 from ._hidden_markov import HiddenMarkovModel as HiddenMarkovModel
 from ._importance import AdaptiveImportance as AdaptiveImportance
+from ._information import Information as Information
+from ._information import information as information
 from ._inputs import Inputs as Inputs
 from ._learn import learn as learn
 from ._markov_estimators import full_information_markov as full_information_markov
@@ -50,6 +52,7 @@ from ._markov_parameters import MarkovParameters as MarkovParameters
 from ._markov_parameters import impulse_response as impulse_response
 from ._markov_parameters import markov_log_likelihood as markov_log_likelihood
 from ._markov_parameters import markov_parameters_of as markov_parameters_of
+from ._mclmc import MCLMC as MCLMC
 from ._model import AbstractAffine as AbstractAffine
 from ._model import AbstractStateSpaceModel as AbstractStateSpaceModel
 from ._model import Coordinates as Coordinates
@@ -62,6 +65,8 @@ from ._model import LinearObservation as LinearObservation
 from ._model import Propagator as Propagator
 from ._model import StateSpaceModel as StateSpaceModel
 from ._model import intervals_between as intervals_between
+from ._modes import Mode as Mode
+from ._modes import modes as modes
 from ._neural_hamiltonian import NSSNN as NSSNN
 from ._neural_hamiltonian import AuthorsInitialisation as AuthorsInitialisation
 from ._neural_hamiltonian import Xavier as Xavier
@@ -91,10 +96,12 @@ from ._parameters import resolve as resolve
 from ._particle_filter import ParticleFiltered as ParticleFiltered
 from ._particle_filter import SystematicResampling as SystematicResampling
 from ._particle_filter import particle_filter as particle_filter
+from ._pathfinder import Pathfinder as Pathfinder
 from ._posterior import Posterior as Posterior
 from ._posterior import load_posterior as load_posterior
 from ._predict import PosteriorForecast as PosteriorForecast
 from ._predict import posterior_forecast as posterior_forecast
+from ._predict import stochastic_forecast as stochastic_forecast
 from ._prior import LKJ as LKJ
 from ._prior import Flat as Flat
 from ._prior import HalfNormal as HalfNormal
@@ -103,6 +110,8 @@ from ._prior import Laplace as Laplace
 from ._prior import LogDensity as LogDensity
 from ._prior import Normal as Normal
 from ._prior import Prior as Prior
+from ._profile_likelihood import Profile as Profile
+from ._profile_likelihood import profile_likelihood as profile_likelihood
 from ._random_walk import RandomWalk as RandomWalk
 from ._realisation import CorrectedHankel as CorrectedHankel
 from ._realisation import PrintedHankel as PrintedHankel
@@ -114,6 +123,8 @@ from ._recording import Recording as Recording
 from ._recording import read_recordings as read_recordings
 from ._sample import sample as sample
 from ._sample import sample_density as sample_density
+from ._scores import ForecastScores as ForecastScores
+from ._scores import score_forecast as score_forecast
 from ._simulate import simulate as simulate
 from ._simulation_file import parse_simulation as parse_simulation
 from ._simulation_file import read_simulation as read_simulation
@@ -131,6 +142,7 @@ from ._sparse_regression import SparseModel as SparseModel
 from ._sparse_regression import TotalVariation as TotalVariation
 from ._sparse_regression import sindy as sindy
 from ._symbolic import jax_function as jax_function
+from ._tempered_smc import TemperedSMC as TemperedSMC
 from ._train import Trained as Trained
 from ._train import train as train
 from ._trajectory_objectives import EverySteps as EverySteps
@@ -147,6 +159,9 @@ from ._transforms import GaussHermite as GaussHermite
 from ._transforms import Moments as Moments
 from ._transforms import Taylor as Taylor
 from ._transforms import UnscentedTransform as UnscentedTransform
+from ._variational import FullRank as FullRank
+from ._variational import MeanField as MeanField
+from ._variational import VariationalInference as VariationalInference
 from .diagnosis import Diagnosis as Diagnosis
 from .diagnosis import Options as Options
 from .diagnosis import diagnose as diagnose

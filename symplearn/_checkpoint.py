@@ -3,6 +3,7 @@
 import hashlib
 import io
 import os
+import re
 import zipfile
 from pathlib import Path
 from typing import NamedTuple
@@ -14,6 +15,9 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ._errors import InputError, shown
+
+# Where an object lies in memory is part of how it is written, and another in each process.
+_ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
 
 class Checkpoint(NamedTuple):
@@ -57,11 +61,15 @@ class Checkpoint(NamedTuple):
 
 
 def seal_of(parts: PyTree, settings: str) -> str:
-    """A digest of every array of `parts` with its place, and of the settings in words."""
-    digest = hashlib.sha256(settings.encode())
-    for path, leaf in jax.tree_util.tree_flatten_with_path(parts)[0]:
-        if eqx.is_array(leaf):
-            plain = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
-            digest.update(f"{jax.tree_util.keystr(path)} {plain.shape} {plain.dtype}".encode())
-            digest.update(np.asarray(plain).tobytes())
+    """A digest of every leaf of `parts` with its place, of their structure, and of the settings in words."""
+    leaves, structure = jax.tree_util.tree_flatten_with_path(parts)
+    digest = hashlib.sha256(f"{settings} {_ADDRESS.sub('', str(structure))}".encode())
+    for path, leaf in leaves:
+        digest.update(jax.tree_util.keystr(path).encode())
+        if not eqx.is_array(leaf):
+            digest.update(_ADDRESS.sub("", repr(leaf)).encode())
+            continue
+        plain = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        digest.update(f"{plain.shape} {plain.dtype}".encode())
+        digest.update(np.asarray(plain).tobytes())
     return digest.hexdigest()

@@ -58,8 +58,10 @@ class Diagnostics:
     def __str__(self) -> str:
         head = f"R-hat at most {self.worst_r_hat:.3f}, effective sample size at least {self.least_ess:.0f}"
         extra = [] if self.pareto_k is None else [f"Pareto k {self.pareto_k:.2f}"]
-        if self.divergences is not None and self.e_bfmi is not None:
-            extra.append(f"{self.divergences} divergences, E-BFMI at least {np.min(self.e_bfmi):.2f}")
+        if self.divergences is not None:
+            extra.append(f"{self.divergences} divergences")
+        if self.e_bfmi is not None:
+            extra.append(f"E-BFMI at least {np.min(self.e_bfmi):.2f}")
         verdict = "Converged." if self.converged else "NOT CONVERGED: " + " ".join(self.problems)
         return f"{', '.join([head, *extra])}. {verdict}"
 
@@ -94,19 +96,20 @@ def _problems(facts: Diagnostics, drawn: Drawn) -> tuple[str, ...]:
     if not facts.worst_r_hat <= _R_HAT:
         found.append(
             f"The chains disagree: R-hat of {_worst(facts.r_hat)} is {facts.worst_r_hat:.3f}, above {_R_HAT}; draw "
-            "more, or look for a second mode."
+            "more, or look for a second mode with `TemperedSMC`."
         )
     if not facts.least_ess >= _ESS:
         found.append(f"The draws are worth {facts.least_ess:.0f} independent ones, fewer than {_ESS}; draw more.")
     heavy = facts.pareto_k is not None and not facts.pareto_k <= _PARETO_K
     if heavy and (drawn.largest_weight or 0.0) > NEGLIGIBLE:
         found.append(
-            f"A few draws carry the weight (Pareto k {facts.pareto_k:.2f}, above {_PARETO_K}): take more `rounds` or a "
-            "larger `batch`, or sample with `RandomWalk` or `NUTS`."
+            f"A few draws carry the weight (Pareto k {facts.pareto_k:.2f}, above {_PARETO_K}): what they were drawn "
+            "from misses a part of the density; sample with `AdaptiveImportance`, there with more `rounds` or a larger "
+            "`batch`, or with `RandomWalk` or `NUTS`."
         )
     if facts.divergences is not None and facts.divergences > _DIVERGENT * chains * draws:
         found.append(
-            f"{facts.divergences} of {chains * draws} trajectories diverged: raise NUTS's `acceptance` towards 1, or "
+            f"{facts.divergences} of {chains * draws} trajectories diverged: raise the `acceptance` towards 1, or "
             "sample with `RandomWalk`."
         )
     if facts.e_bfmi is not None and not np.min(facts.e_bfmi) >= _E_BFMI:

@@ -15,11 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
+from ._blocks import Course
+from ._chains import AbstractKernel, Plan, run_chains
 from ._errors import InputError
 from ._importance import AdaptiveImportance
 from ._parameters import flatten, named_parameters, partition
-from ._sampler import AbstractSampler, Drawn, LogDensity, possible, refuse_counts
-from ._scout import SCOUT, scouted
+from ._sampler import AbstractBlockSampler, Drawn, LogDensity, possible, refuse_counts
+from ._scout import SCOUT
 from ._whitening import Whitening
 
 
@@ -47,7 +49,7 @@ class DRAMInfo(NamedTuple):
     second: Bool[Array, " block"]
 
 
-class DRAM(AbstractSampler):
+class DRAM(AbstractBlockSampler):
     """Delayed rejection adaptive Metropolis within Gibbs: the dissertation's own sampler, corrected.
 
     In each sweep every block of `blocks` is moved in turn, the others held; `blocks` are tuples of places in the free
@@ -73,23 +75,23 @@ class DRAM(AbstractSampler):
         if not 0 < self.shrinkage < 1:
             raise InputError(f"`DRAM` needs `shrinkage` between 0 and 1, but was given {self.shrinkage}.")
 
-    def draw(self, density: LogDensity, start: Whitening, key: PRNGKeyArray) -> Drawn:
+    def draw_in(self, course: Course, density: LogDensity, start: Whitening, key: PRNGKeyArray) -> Drawn:
         blocks = _checked(self.blocks, start.centre.size)
-        scout_key, chain_key = jax.random.split(key)
-        scouting = scouted(self.scout, density, start, self.chains, scout_key)
-        free, moves = scouting.whitening.free(scouting.z), np.concatenate(blocks)
-        held = np.setdiff1d(np.arange(start.centre.size), moves)
-        free = free.at[:, held].set(start.centre[held])
-        root = scouting.whitening.root
-        covariance = root @ root.T
+        plan = Plan(self.steps // 4, self.steps // self.thin, self.thin)
         sweep = _Sweep(density, blocks, self.patience, self.shrinkage)
-        run = _run(self, sweep, free, covariance, chain_key)
-        sweeps = self.steps // 4 + self.steps // self.thin * self.thin
+
+        def kernel_in(whitening: Whitening) -> _Sweeps:
+            return _Sweeps(sweep, whitening, start.centre, plan.warm_up)
+
+        run = run_chains(course, plan, kernel_in, self.scout, density, start, self.chains, key)
+        free, log_density = run.draws(plan)
         return Drawn(
-            run[0],
-            run[1],
-            evaluations=scouting.evaluations + 2 * sweeps * self.chains * len(blocks),
-            accepted=float(run[2]),
+            free,
+            log_density,
+            evaluations=int(run.scouting) + 2 * int(run.steps) * self.chains * len(blocks),
+            accepted=float(run.state.accepted) / max(1, int(run.steps) - plan.warm_up),
+            stopped=course.interrupted,
+            remarks=run.remarks(plan),
         )
 
 
@@ -206,19 +208,33 @@ def _learnt(record: Adapted, x: Array, sweeps: Array) -> Adapted:
     return Adapted(mean, record.scatter + jnp.outer(x - record.mean, x - mean), record.given)
 
 
-@eqx.filter_jit
-def _run(options, sweep, free, covariance, key):
-    def one(states, key):
-        states, info = jax.vmap(sweep.step)(jax.random.split(key, len(free)), states)
-        return states, jnp.mean(info.first | info.second)
+class _State(NamedTuple):
+    """The chains, and the sum after warm-up of the shares of moves accepted."""
 
-    def keep(states, key):
-        states, accepted = jax.lax.scan(one, states, jax.random.split(key, options.thin))
-        return states, (states.position, states.log_density, jnp.mean(accepted))
+    states: DRAMState
+    accepted: Array
 
-    warm_key, keep_key = jax.random.split(key)
-    states = jax.vmap(sweep.init, in_axes=(0, None))(free, covariance)
-    states, _ = jax.lax.scan(one, states, jax.random.split(warm_key, options.steps // 4))
-    keys = jax.random.split(keep_key, options.steps // options.thin)
-    _, (positions, heights, accepted) = jax.lax.scan(keep, states, keys)
-    return jnp.swapaxes(positions, 0, 1), heights.T, jnp.mean(accepted)
+
+class _Sweeps(AbstractKernel):
+    """The sweeps of all chains; what is in no block stays at `centre`."""
+
+    sweep: _Sweep
+    whitening: Whitening
+    centre: Array
+    warm_up: int
+
+    def begin(self, z):
+        held = np.setdiff1d(np.arange(self.centre.size), np.concatenate(self.sweep.blocks))
+        free = self.whitening.free(z).at[:, held].set(self.centre[held])
+        root = self.whitening.root
+        states = jax.vmap(self.sweep.init, in_axes=(0, None))(free, root @ root.T)
+        return _State(states, jnp.zeros(()))
+
+    def step(self, state, k, key):
+        keys = jax.random.split(key, len(state.states.log_density))
+        states, info = jax.vmap(self.sweep.step)(keys, state.states)
+        accepted = jnp.mean(info.first | info.second)
+        return _State(states, state.accepted + jnp.where(k < self.warm_up, 0.0, accepted))
+
+    def kept(self, state):
+        return state.states.position, state.states.log_density

@@ -1,5 +1,6 @@
 """Adaptive multiple importance sampling: weighted draws of Student mixtures that learn where the posterior is."""
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -11,8 +12,10 @@ from jaxtyping import PRNGKeyArray
 from scipy.special import logsumexp, softmax
 
 from ._arviz import pareto_k
+from ._blocks import Course
 from ._errors import InputError
-from ._sampler import NEGLIGIBLE, AbstractSampler, Drawn, LogDensity, generator, refuse_counts, whitened
+from ._rounds import Rounds
+from ._sampler import NEGLIGIBLE, AbstractBlockSampler, Drawn, LogDensity, generator, refuse_counts, whitened
 from ._student_mixture import StudentMixture, refined, scatter
 from ._whitening import Whitening
 
@@ -30,7 +33,7 @@ _LEARNT = 0.25
 _VARIANCE = 0.5
 
 
-class AdaptiveImportance(AbstractSampler):
+class AdaptiveImportance(AbstractBlockSampler):
     """Adaptive multiple importance sampling. Cornuet et al. (2012), Scand. J. Statist. 39, 798.
 
     Rounds of `batch` draws from a mixture of `components` Student t densities, fitted to all draws before, each
@@ -57,20 +60,15 @@ class AdaptiveImportance(AbstractSampler):
         if not self.dof > 2:
             raise InputError(f"`AdaptiveImportance` needs `dof` above 2, but was given {self.dof}.")
 
-    def draw(self, density: LogDensity, start: Whitening, key: PRNGKeyArray) -> Drawn:
+    def draw_in(self, course: Course, density: LogDensity, start: Whitening, key: PRNGKeyArray) -> Drawn:
         random = generator(key)
-        sample = weighted_sample(self, density, start, random)
-        rows = _dealt(sample.log_weights, self.draws // _HANDS, random)
-        log_evidence, error = _evidence(sample.log_weights)
-        return Drawn(
-            start.free(jnp.asarray(sample.z[rows])),
-            jnp.asarray(sample.log_density[rows]) - start.log_volume,
-            evaluations=sample.evaluations,
-            pareto_k=pareto_k(sample.log_weights),
-            largest_weight=largest_share(sample.log_weights),
-            log_evidence=log_evidence,
-            log_evidence_sd=error,
-        )
+        sample = weighted_sample(self, density, start, random, course)
+        drawn = resampled(sample, start, self.draws, random)
+        if not course.interrupted:
+            return drawn
+        rounds = sample.evaluations // self.batch
+        remark = f"Stopped by Ctrl-C after {rounds} of at most {self.rounds} rounds."
+        return dataclasses.replace(drawn, stopped=True, remarks=(remark,))
 
 
 class WeightedSample(NamedTuple):
@@ -84,30 +82,69 @@ class WeightedSample(NamedTuple):
 
 
 def weighted_sample(
-    options: AdaptiveImportance, density: LogDensity, start: Whitening, random: np.random.Generator
+    options: AdaptiveImportance,
+    density: LogDensity,
+    start: Whitening,
+    random: np.random.Generator,
+    course: Course | None = None,
 ) -> WeightedSample:
     """The weighted draws behind the posterior: fresh ones of the proposal that adaptation ended with.
 
-    **Raises:** `InputError` where no draw has a finite density.
+    **Raises:** `InputError` where no draw has a finite density; `KeyboardInterrupt` where Ctrl-C came before the first
+    fresh round.
     """
-    proposal, spent = _adaptation(options, density, start, random)
-    z, log_density = np.zeros((0, start.centre.size)), np.zeros(0)
-    while True:
-        new = proposal.sample(random, options.batch)
-        z = np.concatenate([z, new])
-        log_density = np.concatenate([log_density, np.asarray(_densities(density, start, jnp.asarray(new)))])
-        log_weights = log_density - proposal.log_density(z)
-        done = spent + len(z) // options.batch
-        _refuse_nothing(log_weights)
-        if (kish(log_weights) >= options.target and _light(log_weights)) or done >= options.rounds:
-            return WeightedSample(z, log_density, log_weights, done * options.batch)
+    course = Course("sample") if course is None else course
+    # One round to adapt and one to draw there are in any case.
+    rounds = Rounds(lambda z: densities(density, start, z), max(2, options.rounds), options.batch, course)
+    try:
+        proposal, spent = _adaptation(options, rounds, start.centre.size, random)
+        return _fresh(options, rounds, proposal, spent, random)
+    finally:
+        course.save(rounds.state)
+
+
+def _fresh(
+    options: AdaptiveImportance, rounds: Rounds, proposal: StudentMixture, spent: int, random: np.random.Generator
+) -> WeightedSample:
+    """Rounds of draws of the proposal, until they are enough, used up or stopped."""
+    z, log_density = np.zeros((0, proposal.means.shape[1])), np.zeros(0)
+    sample = None
+    try:
+        while sample is None or sample.evaluations < options.rounds * options.batch:
+            new = proposal.sample(random, options.batch)
+            z, log_density = np.concatenate([z, new]), np.concatenate([log_density, rounds(new)])
+            log_weights = log_density - proposal.log_density(z)
+            refuse_nothing(log_weights)
+            sample = WeightedSample(z, log_density, log_weights, spent * options.batch + len(z))
+            if kish(log_weights) >= options.target and _light(log_weights):
+                break
+    except KeyboardInterrupt:
+        if sample is None or not rounds.course.catches:
+            raise
+        rounds.course.interrupted = True
+    return sample
+
+
+def resampled(sample: WeightedSample, start: Whitening, draws: int, random: np.random.Generator) -> Drawn:
+    """`draws` of equal weight in four independent hands, with what the weights say of them, and the evidence."""
+    rows = _dealt(sample.log_weights, draws // _HANDS, random)
+    log_evidence, error = _evidence(sample.log_weights)
+    return Drawn(
+        start.free(jnp.asarray(sample.z[rows])),
+        jnp.asarray(sample.log_density[rows]) - start.log_volume,
+        evaluations=sample.evaluations,
+        pareto_k=pareto_k(sample.log_weights),
+        largest_weight=largest_share(sample.log_weights),
+        log_evidence=log_evidence,
+        log_evidence_sd=error,
+    )
 
 
 def _adaptation(
-    options: AdaptiveImportance, density: LogDensity, start: Whitening, random: np.random.Generator
+    options: AdaptiveImportance, rounds: Rounds, size: int, random: np.random.Generator
 ) -> tuple[StudentMixture, int]:
     """The proposal learnt from some rounds, and how many they were; all of their draws are weighed by all proposals."""
-    size, most = start.centre.size, max(1, options.rounds // 2)
+    most = max(1, options.rounds // 2)
     proposals = [_first(options, size)]
     z, log_density, log_proposals = np.zeros((0, size)), np.zeros(0), np.zeros(0)
     while True:
@@ -117,18 +154,24 @@ def _adaptation(
         under = logsumexp([q.log_density(new) for q in proposals], axis=0)
         log_proposals = np.concatenate([np.logaddexp(log_proposals, latest.log_density(z)), under])
         z = np.concatenate([z, new])
-        log_density = np.concatenate([log_density, np.asarray(_densities(density, start, jnp.asarray(new)))])
+        log_density = np.concatenate([log_density, rounds(new)])
         log_weights = log_density - log_proposals
-        _refuse_nothing(log_weights)
+        refuse_nothing(log_weights)
         proposals.append(_adapted(options, latest, z, log_weights, len(proposals), random))
-        rounds = len(proposals) - 1
-        if (rounds >= _FEWEST and kish(log_weights) >= _LEARNT * options.target) or rounds >= most:
-            return proposals[-1], rounds
+        done = len(proposals) - 1
+        if (done >= _FEWEST and kish(log_weights) >= _LEARNT * options.target) or done >= most:
+            return proposals[-1], done
 
 
-def _refuse_nothing(log_weights: np.ndarray) -> None:
+def refuse_nothing(log_weights: np.ndarray) -> None:
+    """Refuse draws of which none is possible."""
     if not np.any(np.isfinite(log_weights)):
         raise InputError(f"None of {len(log_weights)} draws has a finite log density; start nearer to the mode.")
+
+
+def densities(density: LogDensity, start: Whitening, z: np.ndarray) -> np.ndarray:
+    """The log density of the whitened coordinates at each draw."""
+    return np.asarray(_densities(density, start, jnp.asarray(z)))
 
 
 @eqx.filter_jit

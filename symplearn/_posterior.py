@@ -24,7 +24,10 @@ from ._prior import Prior
 from ._sampler import Drawn
 
 # What of a `Drawn` is one number, kept as an attribute of the file.
-_NUMBERS = ("evaluations", "gradients", "accepted", "pareto_k", "largest_weight", "log_evidence", "log_evidence_sd")
+_NUMBERS = (
+    *("evaluations", "gradients", "accepted", "pareto_k", "largest_weight"),
+    *("log_evidence", "log_evidence_sd", "elbo"),
+)
 _TABLE = ("mean", "sd", "5 %", "50 %", "95 %", "ESS", "R-hat")
 
 
@@ -84,6 +87,11 @@ class Posterior:
         return self.drawn.log_evidence_sd
 
     @property
+    def stopped(self) -> bool:
+        """Whether Ctrl-C ended the sampling before all was drawn; `diagnostics` are of the draws there are."""
+        return self.drawn.stopped
+
+    @property
     def converged(self) -> bool:
         """Whether nothing speaks against the draws."""
         return self.diagnostics.converged
@@ -114,18 +122,14 @@ class Posterior:
         """
         if self.estimate is None:
             raise InputError("This posterior is of a density without a model; its draws are in `values`.")
-        return _models(self.estimate.model, self.draws(count))
+        return models_at(self.estimate.model, self.draws(count))
 
     def draws(self, count: int | None = None) -> Float[Array, "draw parameter"]:
         """Free coordinates of `count` evenly spaced draws, or of all, chain by chain.
 
         **Raises:** `InputError` where `count` is not from 1 to the number of draws.
         """
-        flat = self.free.reshape(-1, self.free.shape[-1])
-        count = len(flat) if count is None else count
-        if not 1 <= count <= len(flat):
-            raise InputError(f"There are {len(flat)} draws, but {count} were asked for; take from 1 to {len(flat)}.")
-        return flat[np.arange(count) * len(flat) // count]
+        return evenly(self.free.reshape(-1, self.free.shape[-1]), count)
 
     def _each(self, summary: Callable[[Array], Array]) -> dict[str, Array]:
         return {name: summary(jnp.reshape(v, (-1, *v.shape[2:]))) for name, v in self.values.items()}
@@ -144,8 +148,8 @@ class Posterior:
         stats = {"lp": drawn.log_density, "free": drawn.free, "diverging": drawn.divergent, "energy": drawn.energy}
         kept = {name: np.asarray(array) for name, array in stats.items() if array is not None}
         numbers = {name: getattr(drawn, name) for name in _NUMBERS if getattr(drawn, name) is not None}
-        attributes = {"sampler": self.sampler, "remarks": "\n".join(drawn.remarks), **numbers}
-        return inference_data({name: np.asarray(v) for name, v in self.values.items()}, kept, attributes)
+        words = {"sampler": self.sampler, "remarks": "\n".join(drawn.remarks), "stopped": int(drawn.stopped)}
+        return inference_data({name: np.asarray(v) for name, v in self.values.items()}, kept, words | numbers)
 
     def save(self, path: str | Path) -> None:
         """Write the draws to a NetCDF file, which `load_posterior` and `arviz.from_netcdf` read. Needs h5netcdf."""
@@ -184,6 +188,7 @@ def load_posterior(path: str | Path, estimate: Estimate | None = None) -> Poster
             arrays["lp"],
             divergent=arrays.get("diverging"),
             energy=arrays.get("energy"),
+            stopped=bool(attributes["stopped"]),
             remarks=remarks,
             **numbers,
         )
@@ -228,8 +233,20 @@ def _values(model, free):
     return jax.vmap(jax.vmap(values))(free)
 
 
+def evenly(draws: Float[Array, "draw parameter"], count: int | None) -> Float[Array, "some parameter"]:
+    """`count` evenly spaced draws, or all.
+
+    **Raises:** `InputError` where `count` is not from 1 to the number of draws.
+    """
+    count = len(draws) if count is None else count
+    if not 1 <= count <= len(draws):
+        raise InputError(f"There are {len(draws)} draws, but {count} were asked for; take from 1 to {len(draws)}.")
+    return draws[np.arange(count) * len(draws) // count]
+
+
 @eqx.filter_jit
-def _models(model, draws):
+def models_at(model, draws):
+    """The model at free coordinates (draw, parameter), in plain arrays, stacked."""
     rebuild = flatten(model)[1]
     return eqx.filter_vmap(lambda free: resolve(rebuild(free)))(draws)
 

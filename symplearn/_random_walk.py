@@ -1,24 +1,26 @@
 """Random-walk Metropolis: many chains at once, steps scaled to the posterior's covariance."""
 
 import math
+from typing import Any, NamedTuple
 
 import blackjax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from blackjax.mcmc.random_walk import normal as normal_step
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray
 
+from ._blocks import Course
+from ._chains import AbstractKernel, Plan, run_chains
 from ._importance import AdaptiveImportance
-from ._sampler import AbstractSampler, Drawn, LogDensity, refuse_counts, whitened
-from ._scout import SCOUT, scouted
+from ._sampler import AbstractBlockSampler, Drawn, LogDensity, refuse_counts, whitened
+from ._scout import SCOUT
 from ._whitening import Whitening
 
 # The best share of accepted steps in many dimensions. Roberts, Gelman and Gilks (1997).
 _ACCEPTED = 0.234
 
 
-class RandomWalk(AbstractSampler):
+class RandomWalk(AbstractBlockSampler):
     """Random-walk Metropolis with normal steps, by blackjax; all chains are one vmapped program.
 
     The chains start at draws of a short importance sampling run, `scout`, whose covariance gives the steps their
@@ -37,50 +39,55 @@ class RandomWalk(AbstractSampler):
     def __check_init__(self):
         refuse_counts(self, chains=2, thin=1, steps=4 * self.thin)
 
-    def draw(self, density: LogDensity, start: Whitening, key: PRNGKeyArray) -> Drawn:
-        scout_key, walk_key = jax.random.split(key)
-        scouting = scouted(self.scout, density, start, self.chains, scout_key)
-        z, log_density, accepted = _walk(self, density, scouting.whitening, scouting.z, walk_key)
-        taken = self.chains * (self.steps // 4 + self.steps // self.thin * self.thin)
+    def draw_in(self, course: Course, density: LogDensity, start: Whitening, key: PRNGKeyArray) -> Drawn:
+        plan = Plan(self.steps // 4, self.steps // self.thin, self.thin)
+
+        def kernel_in(whitening: Whitening) -> _Walk:
+            return _Walk(density, whitening, plan.warm_up)
+
+        run = run_chains(course, plan, kernel_in, self.scout, density, start, self.chains, key)
+        z, log_density = run.draws(plan)
         return Drawn(
-            scouting.whitening.free(z),
-            log_density - scouting.whitening.log_volume,
-            evaluations=scouting.evaluations + taken,
-            accepted=float(accepted),
+            run.whitening.free(z),
+            log_density - run.whitening.log_volume,
+            evaluations=int(run.scouting) + self.chains * int(run.steps),
+            accepted=float(run.state.accepted) / max(1, int(run.steps) - plan.warm_up),
+            stopped=course.interrupted,
+            remarks=run.remarks(plan),
         )
 
 
-@eqx.filter_jit
-def _walk(options, density, whitening, z, key):
-    log_density = whitened(density, whitening)
-    size = z.shape[1]
+class _State(NamedTuple):
+    """The chains, the logarithm of the length of their steps, and the sum of the shares accepted after warm-up."""
 
-    def step(states, scale, key):
-        kernel = blackjax.additive_step_random_walk(log_density, normal_step(scale * jnp.ones(size)))
-        return jax.vmap(kernel.step)(jax.random.split(key, len(z)), states)
+    walk: Any
+    log_scale: Array
+    accepted: Array
 
-    def tune(carry, data):
-        states, log_scale = carry
-        k, key = data
-        states, info = step(states, jnp.exp(log_scale), key)
+
+class _Walk(AbstractKernel):
+    density: Any
+    whitening: Whitening
+    warm_up: int
+
+    def begin(self, z):
+        walk = jax.vmap(self._algorithm(jnp.ones(z.shape[1])).init)(z)
+        return _State(walk, jnp.asarray(math.log(2.38 / math.sqrt(z.shape[1]))), jnp.zeros(()))
+
+    def step(self, state, k, key):
+        count, size = state.walk.position.shape
+        kernel = self._algorithm(jnp.exp(state.log_scale) * jnp.ones(size))
+        walk, info = jax.vmap(kernel.step)(jax.random.split(key, count), state.walk)
+        accepted = jnp.mean(info.acceptance_rate)
         # Robbins and Monro (1951): ever smaller corrections.
-        correction = (jnp.mean(info.acceptance_rate) - _ACCEPTED) * (k + 1.0) ** -0.6
-        return (states, log_scale + correction), None
+        correction = (accepted - _ACCEPTED) * (k + 1.0) ** -0.6
+        tunes = k < self.warm_up
+        return _State(
+            walk, state.log_scale + jnp.where(tunes, correction, 0.0), state.accepted + jnp.where(tunes, 0.0, accepted)
+        )
 
-    def keep(states, key):
-        def one(states, key):
-            states, info = step(states, scale, key)
-            return states, jnp.mean(info.acceptance_rate)
+    def kept(self, state):
+        return state.walk.position, state.walk.logdensity
 
-        states, accepted = jax.lax.scan(one, states, jax.random.split(key, options.thin))
-        return states, (states.position, states.logdensity, jnp.mean(accepted))
-
-    init = blackjax.additive_step_random_walk(log_density, normal_step(jnp.ones(size))).init
-    tune_key, keep_key = jax.random.split(key)
-    count = options.steps // 4
-    begin = jax.vmap(init)(z), jnp.asarray(math.log(2.38 / math.sqrt(size)))
-    (states, log_scale), _ = jax.lax.scan(tune, begin, (jnp.arange(count), jax.random.split(tune_key, count)))
-    scale = jnp.exp(log_scale)
-    keys = jax.random.split(keep_key, options.steps // options.thin)
-    _, (positions, heights, accepted) = jax.lax.scan(keep, states, keys)
-    return jnp.swapaxes(positions, 0, 1), heights.T, jnp.mean(accepted)
+    def _algorithm(self, scale):
+        return blackjax.additive_step_random_walk(whitened(self.density, self.whitening), normal_step(scale))

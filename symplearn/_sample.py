@@ -1,56 +1,92 @@
 """Draws of a posterior, or of any density, by the sampler of your choice."""
 
 import dataclasses
+import os
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
+from ._blocks import Course
+from ._checkpoint import Checkpoint, seal_of
 from ._errors import InputError
 from ._fit import Estimate
 from ._importance import AdaptiveImportance
 from ._parameters import flatten
 from ._posterior import Posterior, log_posterior_of, posterior_of
-from ._sampler import AbstractSampler, Drawn, LogDensity
-from ._whitening import whiten
+from ._sampler import AbstractBlockSampler, AbstractSampler, Drawn, LogDensity
+from ._whitening import Whitening, whiten
 
 
-def sample(estimate: Estimate, *, sampler: AbstractSampler | None = None, key: PRNGKeyArray) -> Posterior:
+def sample(
+    estimate: Estimate,
+    *,
+    sampler: AbstractSampler | None = None,
+    key: PRNGKeyArray,
+    checkpoint: str | os.PathLike | None = None,
+) -> Posterior:
     """Draw from the posterior around an estimate. Dissertation (2.13) to (2.18), Algorithm 3 corrected.
 
     The estimate need not have converged, nor its Hessian be positive definite: the sampler's scale is measured where
     the Hessian is of no use. Whether the draws can be trusted is in the result: `posterior.converged`.
 
-    **Arguments:** `sampler` - `AdaptiveImportance()`, `RandomWalk()`, `NUTS()` or `DRAM()`; `key` - of
-    `jax.random.key`.
+    Samplers run in blocks of some seconds. Beyond two seconds progress is told on stderr, every ten. Ctrl-C ends the
+    run after its block: the draws so far come back as a posterior that is `stopped` and says so; where there are none
+    yet, as in warm-up, the interrupt is raised.
 
-    **Raises:** `InputError` where the estimate's log posterior is not finite.
+    **Arguments:** `sampler` - `AdaptiveImportance()`, `RandomWalk()`, `NUTS()`, `MCLMC()` or `DRAM()`; `TemperedSMC()`
+    for several modes; `Pathfinder()` or `VariationalInference()` for a first look; `key` - of `jax.random.key`;
+    `checkpoint` - a file that is written every minute and at the end, also one by Ctrl-C or an exception, whole or not
+    at all. Where it exists, sampling goes on from it and ends at the same draws, to the last bit, as without the stop;
+    a scouting run that was stopped is done again.
+
+    **Raises:** `InputError` where the estimate's log posterior is not finite, the checkpoint is damaged or of another
+    computation, or the sampler has no blocks to keep.
     """
     sampler = AdaptiveImportance() if sampler is None else sampler
-    return posterior_of(
-        estimate, _drawn(log_posterior_of(estimate), flatten(estimate.model)[0], sampler, key), str(sampler)
-    )
+    density, centre = log_posterior_of(estimate), flatten(estimate.model)[0]
+    start = whiten(density, centre)
+    return posterior_of(estimate, _drawn(density, start, sampler, key, checkpoint, (density, centre)), str(sampler))
 
 
 def sample_density(
-    log_density: LogDensity, start: Any, *, sampler: AbstractSampler | None = None, key: PRNGKeyArray
+    log_density: LogDensity,
+    start: Any,
+    *,
+    sampler: AbstractSampler | None = None,
+    key: PRNGKeyArray,
+    checkpoint: str | os.PathLike | None = None,
 ) -> Posterior:
     """Draw from a density of your own; the draws are `posterior.values["x"]`, (chain, draw, parameter).
 
     **Arguments:** `log_density` - a function of a vector (parameter,) to nats, which JAX can differentiate; it need not
-    be normalised; `start` (parameter,) - near its mode; the others as in `sample`.
+    be normalised; `start` (parameter,) - near its mode; the others as in `sample`. A checkpoint knows a density by its
+    arrays and by its shape around the start: of two that agree in both it cannot tell one from the other.
 
-    **Raises:** `InputError` where the start is no vector, or the log density is not finite there.
+    **Raises:** `InputError` where the start is no vector, the log density is not finite there, or as `sample` for a
+    checkpoint.
     """
     start = jnp.asarray(start, dtype=float)
     if start.ndim != 1 or start.size == 0:
         raise InputError(f"`sample_density` needs a vector to start from, but was given the shape {start.shape}.")
     sampler = AdaptiveImportance() if sampler is None else sampler
-    return posterior_of(None, _drawn(log_density, start, sampler, key), str(sampler))
+    around = whiten(log_density, start)
+    return posterior_of(
+        None, _drawn(log_density, around, sampler, key, checkpoint, (log_density, around)), str(sampler)
+    )
 
 
-def _drawn(density: LogDensity, centre: Any, sampler: AbstractSampler, key: PRNGKeyArray) -> Drawn:
-    start = whiten(density, centre)
-    drawn = sampler.draw(density, start, key)
+def _drawn(
+    density: LogDensity, start: Whitening, sampler: AbstractSampler, key: PRNGKeyArray, checkpoint: Any, known_by: Any
+) -> Drawn:
+    if isinstance(sampler, AbstractBlockSampler):
+        seal = seal_of((known_by, key), str(sampler))
+        file = None if checkpoint is None else Checkpoint(Path(checkpoint), seal)
+        drawn = sampler.draw_in(Course("sample", file, catches=True), density, start, key)
+    elif checkpoint is not None:
+        raise InputError(f"`{type(sampler).__name__}` draws all at once and keeps no checkpoint; leave it out.")
+    else:
+        drawn = sampler.draw(density, start, key)
     remarks = (*drawn.remarks, start.statement) if start.statement else drawn.remarks
     return dataclasses.replace(drawn, remarks=remarks)

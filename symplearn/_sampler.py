@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from ._blocks import Course
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
 from ._fit import guarded
@@ -27,7 +28,8 @@ class Drawn(eqx.Module):
     `free` and `log_density` (nats, not normalised) are of independent chains. `divergent` and `energy` are those of
     Hamiltonian trajectories, `accepted` is the share of proposals taken, `pareto_k` the shape of the tail of importance
     weights and `largest_weight` the largest one's share. `evaluations` counts the density's values, those of warm-up
-    included; `gradients` likewise.
+    included; `gradients` likewise. `elbo` is a normal approximation's lower bound of the log evidence. `stopped` says
+    that Ctrl-C ended the sampling before all was drawn.
     """
 
     free: Float[Array, "chain draw parameter"]
@@ -41,6 +43,8 @@ class Drawn(eqx.Module):
     largest_weight: float | None = None
     log_evidence: float | None = None
     log_evidence_sd: float | None = None
+    elbo: float | None = None
+    stopped: bool = False
     remarks: tuple[str, ...] = ()
 
 
@@ -53,6 +57,17 @@ class AbstractSampler(eqx.Module):
 
         `density` is a pytree, or a function, that maps a vector (parameter,) to nats.
         """
+
+
+class AbstractBlockSampler(AbstractSampler):
+    """A sampler that draws in blocks: long runs are told on stderr, kept in a file, and stopped between two blocks."""
+
+    @abc.abstractmethod
+    def draw_in(self, course: Course, density: LogDensity, start: Whitening, key: PRNGKeyArray) -> Drawn:
+        """`draw`, told and kept as the course says, and from the course's file on where there is one."""
+
+    def draw(self, density: LogDensity, start: Whitening, key: PRNGKeyArray) -> Drawn:
+        return self.draw_in(Course("sample"), density, start, key)
 
 
 def possible(value: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
+from ._blocks import Course
 from ._importance import AdaptiveImportance, softened, weighted_sample
 from ._sampler import LogDensity, generator
 from ._student_mixture import scatter
@@ -28,7 +29,7 @@ def scouted(
 ) -> Scouting:
     """Starts for chains, independent and a little too far apart where importance sampling works badly."""
     random = generator(key)
-    sample = weighted_sample(options, density, start, random)
+    sample = weighted_sample(options, density, start, random, Course("sample: scouting"))
     weights = softened(sample.log_weights, least=5.0 * (sample.z.shape[1] + 1))
     root = np.linalg.cholesky(scatter(sample.z, weights))
     mean = weights @ sample.z

@@ -6,8 +6,6 @@ over many models; `train` drives one of them with progress and a checkpoint.
 
 import math
 import os
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +17,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
+from ._blocks import Course, run_blocks
 from ._checkpoint import Checkpoint, seal_of
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
@@ -29,8 +28,6 @@ from ._prior import AbstractDensity, Prior
 
 # Another recording's nats may be added to the impossible one's.
 _HOPELESS = -0.5 * IMPOSSIBLE
-# Seconds of epochs that run at once, and at least between two checkpoints: those of many models are large.
-_PAUSE, _BETWEEN_FILES = 2.0, 60.0
 
 
 class TrainingState(eqx.Module):
@@ -268,32 +265,20 @@ def run_epochs(
     From the checkpoint, where there is one. It stops early, at a state whose `epoch` says so, where the next epochs
     would end after the `deadline` of `time.monotonic`, which is asked each time.
     """
-    if checkpoint is not None:
-        state = checkpoint.load(state)
-    epochs, count, each = state.history.shape[-1], 1, 0.0
-    saved = time.monotonic()
-    due = saved + _PAUSE
-    try:
-        while (done := int(np.max(state.epoch))) < epochs:
-            began, count = time.monotonic(), min(count, epochs - done)
-            if began + count * each > deadline():
-                break
-            state = jax.block_until_ready(advance(state, jnp.asarray(count)))
-            now = time.monotonic()
-            if checkpoint is not None and now - saved > _BETWEEN_FILES:
-                checkpoint.save(state)
-                saved = now
-            if now > due:
-                due = now + 5.0 * _PAUSE
-                best = float(np.median(state.best_score))
-                print(f"{what}: epoch {done + count} of {epochs}, best {best:.6g} nats", file=sys.stderr, flush=True)
-            # The first epochs hold the compilation: by and by more of them fill the pause.
-            each = (now - began) / count
-            count = max(1, min(4 * count, int(_PAUSE / max(each, 1e-6))))
-    finally:
-        if checkpoint is not None:
-            checkpoint.save(state)
-    return state
+    course = Course(what, checkpoint)
+    found = course.resumed(lambda: state)
+    epochs = state.history.shape[-1]
+    return run_blocks(
+        course,
+        advance,
+        state if found is None else found,
+        lambda state: int(np.max(state.epoch)),
+        epochs,
+        lambda state: (
+            f"epoch {int(np.max(state.epoch))} of {epochs}, best {float(np.median(state.best_score)):.6g} nats"
+        ),
+        deadline=deadline,
+    )
 
 
 @eqx.filter_jit

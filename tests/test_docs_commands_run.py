@@ -12,6 +12,7 @@ from command_line_cases import DEMO, ROOT, environment
 from contract import check_document, strict_json
 
 PAGE = (ROOT / "docs" / "diagnose-a-recording.md").read_text(encoding="utf-8")
+LEARNING = (ROOT / "docs" / "learn-a-hamiltonian.md").read_text(encoding="utf-8")
 LIBRARY = (ROOT / "docs" / "marginal-likelihood.md").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
@@ -74,23 +75,27 @@ def test_names_on_the_pages_exist():
     for option in set(re.findall(r"`--([a-z-]+)", PAGE)) - {"no-cache"}:
         assert option.replace("-", "_") in source, option
     assert all(f"`{name}`" in PAGE for name in EFFECTS)
-    for text, home in ((PAGE, ROOT / "docs"), (README, ROOT)):
+    for text, home in ((PAGE, ROOT / "docs"), (LIBRARY, ROOT / "docs"), (LEARNING, ROOT / "docs"), (README, ROOT)):
         for link in re.findall(r"\]\(([^)#]+)\)", text):
             assert (home / link).exists(), link
 
 
 def test_pages_name_no_machine():
     """No absolute path of anybody's machine stands in README or docs."""
-    assert not re.search(r"(?<![\w.~])/(?:home|work|root|Users|tmp)/", README + PAGE)
+    assert not re.search(r"(?<![\w.~])/(?:home|work|root|Users|tmp)/", README + PAGE + LEARNING + LIBRARY)
 
 
 @pytest.mark.slow
-def test_python_of_the_library_page(checkout):
-    """The Python of "Learn a model from a recording" runs in order, and what it asserts of itself holds."""
+@pytest.mark.parametrize(
+    ("page", "said"),
+    [(LIBRARY, ["converged", "FAILED at reading"]), (LEARNING, ["+0.5", "Converged.", "NOT bounded", "Trained"])],
+)
+def test_python_of_the_library_pages(page, said, checkout):
+    """The Python of "Learn a model" and "Learn a Hamiltonian" runs in order, and what it asserts of itself holds."""
     folder, places = checkout
-    program = "\n".join(blocks(LIBRARY, "python"))
+    program = "\n".join(blocks(page, "python"))
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=folder, env=places, capture_output=True, text=True, timeout=600
     )
     assert done.returncode == 0, done.stderr
-    assert "converged" in done.stdout and "FAILED at reading" in done.stdout
+    assert all(words in done.stdout for words in said)

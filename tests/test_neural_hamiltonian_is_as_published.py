@@ -10,8 +10,6 @@ from symplearn._errors import InputError
 from symplearn._neural_hamiltonian import NSSNN, AuthorsInitialisation, Xavier
 from symplearn._parameters import flatten
 
-pytestmark = pytest.mark.slow  # four minutes with its neighbours of issues 4 and 5
-
 
 def forward(network, z):
     """H and its gradient at z by plain loops of numpy: the chain rule, layer by layer."""

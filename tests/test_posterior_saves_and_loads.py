@@ -1,5 +1,7 @@
 """A posterior survives its file, and a file is not taken for another posterior's."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,35 +10,43 @@ from estimation_cases import linear_system, simulate
 
 from symplearn._arviz import arviz
 from symplearn._errors import InputError
-from symplearn._fit import fit
+from symplearn._fit import Estimate
 from symplearn._importance import AdaptiveImportance
 from symplearn._model import Gaussian, LinearDynamics, LinearObservation, StateSpaceModel
 from symplearn._noise import AdditiveGaussian, Dense, Diagonal
-from symplearn._objectives import TimeSeries
+from symplearn._objectives import MarginalLikelihood, TimeSeries
 from symplearn._parameters import Frozen, Learnt, Positive
-from symplearn._posterior import load_posterior
+from symplearn._posterior import load_posterior, log_posterior_of, posterior_of
 from symplearn._prior import HalfNormal, Normal, Prior
-from symplearn._sample import sample, sample_density
-
-pytestmark = pytest.mark.slow  # four minutes with its neighbours of issues 4 and 5
+from symplearn._sample import sample_density
+from symplearn._sampler import Drawn
 
 SAMPLER = AdaptiveImportance(draws=200, batch=200, target=100, rounds=4)
 
 
 @pytest.fixture(scope="module")
 def estimate():
+    """An estimate that nobody fitted: a posterior's file knows nothing of how good it is."""
     A, H, Q, R, m0, P0 = linear_system()
     ys = simulate(A, H, Q, R, m0, P0, 6, np.random.default_rng(3))[1]
     noises = AdditiveGaussian(Dense(Q)), AdditiveGaussian(Diagonal(Positive(jnp.array([0.2, 0.1]))))
     parts = LinearDynamics(Frozen(jnp.asarray(A))), LinearObservation(Frozen(jnp.asarray(H)))
     model = StateSpaceModel(*parts, *noises, Gaussian(Learnt(jnp.zeros(3)), jnp.asarray(P0)))
     prior = Prior({"initial": Normal(0.0, 4.0), "measurement_noise": HalfNormal(1.0)})
-    return fit(model, TimeSeries(np.arange(6.0), ys), prior=prior)
+    return Estimate(model, TimeSeries(np.arange(6.0), ys), MarginalLikelihood(), prior, *[0.0] * 4, True, 1)
 
 
 @pytest.fixture(scope="module")
 def posterior(estimate):
-    return sample(estimate, sampler=SAMPLER, key=jax.random.key(0))
+    """Draws with everything that one sampler or another tells of them."""
+    rng = np.random.default_rng(0)
+    free = jnp.asarray(0.1 * rng.normal(size=(4, 50, 5)))
+    heights = jax.vmap(jax.vmap(log_posterior_of(estimate)))(free)
+    numbers = dict(accepted=0.3, pareto_k=0.25, largest_weight=0.01, log_evidence=-12.3, log_evidence_sd=0.04)
+    chains = dict(divergent=jnp.asarray(rng.random((4, 50)) < 0.1), energy=jnp.asarray(rng.normal(size=(4, 50))))
+    remarks = ("Stopped by Ctrl-C after 50 of 60 draws of each chain.", "Another remark.")
+    drawn = Drawn(free, heights, evaluations=900, gradients=50, **numbers, **chains, stopped=True, remarks=remarks)
+    return posterior_of(estimate, drawn, "the test")
 
 
 def test_what_is_read_is_what_was_written(estimate, posterior, tmp_path):
@@ -48,6 +58,9 @@ def test_what_is_read_is_what_was_written(estimate, posterior, tmp_path):
     np.testing.assert_array_equal(back.log_posterior, posterior.log_posterior)
     assert str(back) == str(posterior)
     assert back.log_evidence == posterior.log_evidence and back.drawn.evaluations == posterior.drawn.evaluations
+    for one, other in zip(jax.tree.leaves(back.drawn), jax.tree.leaves(posterior.drawn), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert back.stopped and back.drawn.remarks == posterior.drawn.remarks
 
 
 def test_arviz_reads_it(posterior, tmp_path):
@@ -83,7 +96,7 @@ def test_summaries_are_those_of_the_draws(posterior):
 def test_another_posterior_is_refused(estimate, posterior, tmp_path):
     """Draws are not turned into models of another prior, another model, or of none."""
     posterior.save(tmp_path / "draws.nc")
-    wider = fit(estimate.model, estimate.recording, prior=Prior(Normal(0.0, 9.0)))
+    wider = dataclasses.replace(estimate, prior=Prior(Normal(0.0, 9.0)))
     with pytest.raises(InputError, match="is of another recording, model or prior"):
         load_posterior(tmp_path / "draws.nc", wider)
     with pytest.raises(InputError, match="holds draws of .*, but what learns is: x"):

@@ -14,8 +14,6 @@ from symplearn._random_walk import RandomWalk
 from symplearn._sample import sample_density
 from symplearn._sampler import Drawn
 
-pytestmark = pytest.mark.slow  # four minutes with its neighbours of issues 4 and 5
-
 SCOUT = AdaptiveImportance(batch=100, target=100, rounds=4)
 
 

@@ -14,6 +14,7 @@ from symplearn._dram import DRAM, blocks_of, second_stage
 from symplearn._errors import InputError
 from symplearn._fit import Estimate, fit
 from symplearn._importance import AdaptiveImportance
+from symplearn._mclmc import MCLMC
 from symplearn._model import Gaussian, LinearDynamics, LinearObservation, StateSpaceModel
 from symplearn._noise import AdditiveGaussian, Dense
 from symplearn._nuts import NUTS
@@ -22,8 +23,7 @@ from symplearn._parameters import Frozen, Learnt
 from symplearn._prior import Normal, Prior
 from symplearn._random_walk import RandomWalk
 from symplearn._sample import sample, sample_density
-
-pytestmark = pytest.mark.slow  # four minutes with its neighbours of issues 4 and 5
+from symplearn._tempered_smc import TemperedSMC
 
 SCOUT = AdaptiveImportance(batch=200, target=200, rounds=8)
 SAMPLERS = [
@@ -32,8 +32,10 @@ SAMPLERS = [
     NUTS(chains=4, draws=800, warm_up=300, doublings=6, scout=SCOUT),
     DRAM(chains=8, steps=3000, thin=3, shrinkage=0.25, scout=SCOUT),
     DRAM(blocks=((0,), (1,)), chains=8, steps=4000, thin=4, shrinkage=0.25, scout=SCOUT),
+    MCLMC(chains=8, draws=1000, scout=SCOUT),
+    TemperedSMC(),
 ]
-NAMES = ["importance", "random walk", "NUTS", "DRAM", "DRAM within Gibbs"]
+NAMES = ["importance", "random walk", "NUTS", "DRAM", "DRAM within Gibbs", "MCLMC", "tempered SMC"]
 
 
 class Bent(eqx.Module):
@@ -105,11 +107,15 @@ def closed_form(A, H, Q, R, P0, V, ys):
     return gain @ y, V - gain @ M @ V, evidence
 
 
-# The last two take long to compile, and are held to closed forms above.
-BY_COST = [*SAMPLERS[:2], *(pytest.param(sampler, marks=pytest.mark.slow) for sampler in SAMPLERS[2:4])]
+# The others take long to compile, and are held to closed forms above.
+BY_COST = [
+    pytest.param(sampler, id=name, marks=() if name in ("importance", "tempered SMC") else pytest.mark.slow)
+    for name, sampler in zip(NAMES, SAMPLERS, strict=True)
+    if name != "DRAM within Gibbs"  # its blocks are of two parameters
+]
 
 
-@pytest.mark.parametrize("sampler", BY_COST, ids=NAMES[:4])
+@pytest.mark.parametrize("sampler", BY_COST)
 def test_moments_of_a_conjugate_posterior(conjugate, sampler):
     """The posterior of a linear model's initial mean is the normal one of the textbook."""
     estimate, (mean, covariance, evidence) = conjugate
@@ -122,8 +128,8 @@ def test_moments_of_a_conjugate_posterior(conjugate, sampler):
             assert off_by(draws[..., i] * draws[..., j], covariance[i, j]) < 3.0
     if posterior.log_evidence is not None:
         assert abs(posterior.log_evidence - evidence) < 3 * posterior.log_evidence_sd
-        # The weights are near equal: a standard error of 3 % at 1500 effective draws.
-        assert posterior.log_evidence_sd < 0.03
+        # Without it the line before could not fail: 1500 effective draws, or 8 runs through four powers.
+        assert posterior.log_evidence_sd < 0.1
 
 
 def test_log_posterior_is_that_of_the_draw(conjugate):

@@ -21,8 +21,6 @@ from symplearn._optimisers import Adam, ByLeaf
 from symplearn._parameters import Positive
 from symplearn._prior import Flat, HalfNormal, Normal, Prior
 
-pytestmark = pytest.mark.slow  # four minutes with its neighbours of issues 4 and 5
-
 N, DT = 24, 0.1
 PRIOR = Prior({"dynamics": Normal(0.0, 10.0), "process_noise": HalfNormal(1.0)})
 RATES = ByLeaf({"": Adam(0.1, 10, 0.8, clip=1e3), "process_noise": Adam(0.1, betas=(0.1, 0.1))})
