@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 
 from symplearn._objectives import TimeSeries
 
-COLOURS = {"symplectic": "tab:blue", "rk2": "tab:red", "order8_step_5_times_larger": "tab:green"}
+COLOURS = {"symplectic": "tab:blue", "rk2": "tab:red", "order4_step_5_times_larger": "tab:green"}
 NAMES = {
     "symplectic": "leapfrog",
     "rk2": "Runge-Kutta 2",
-    "order8_step_5_times_larger": "order 8,\n5 times the step",
+    "order4_step_5_times_larger": "order 4,\n5 times the step",
 }
 
 

@@ -50,7 +50,7 @@ DRAWS = 100  # paths of the stochastic simulation
 class Settings(NamedTuple):
     """How much is trained: readings, repeats, units of a layer, epochs, and intervals of a piece and of a batch."""
 
-    count: int
+    readings: int
     repeats: int
     width: int
     epochs: int
@@ -59,7 +59,7 @@ class Settings(NamedTuple):
 
 
 FULL = Settings(2000, 20, 64, 1000, 50)
-QUICK = Settings(500, 5, 16, 120, 25)
+QUICK = Settings(200, 5, 16, 300, 25, 50)
 
 
 class InPieces(AbstractObjective):
@@ -98,10 +98,10 @@ def orbit(start: Sequence[float], count: int) -> np.ndarray:
 
 def recordings(settings: Settings, seed: int) -> TimeSeries:
     """The readings of all rows: the repeats of the regular motion, then those of the chaotic one."""
-    times = np.tile(STEP * np.arange(settings.count), (2 * settings.repeats, 1))
+    times = np.tile(STEP * np.arange(settings.readings), (2 * settings.repeats, 1))
     rows = []
     for i, start in enumerate(STARTS.values()):
-        truth = orbit(start, settings.count)
+        truth = orbit(start, settings.readings)
         draws = [np.random.default_rng([seed, i, r]) for r in range(settings.repeats)]
         rows += [truth * draw.uniform(1 - NOISE, 1 + NOISE, truth.shape) for draw in draws]
     return TimeSeries(times, np.array(rows))
@@ -125,7 +125,7 @@ def _models(keys: Array, starts: Array, width: int, learns: bool) -> Any:
 def training_of(settings: Settings, way: str) -> Training:
     """Adam with the published rates, which fall 20 times by 0.8; in log theta_q a rate of 1 is one of theta_q."""
     decay, nothing = settings.epochs // 20, jax.random.key(0)
-    network, intervals = Adam(0.05, decay, 0.8), settings.count - 1
+    network, intervals = Adam(0.05, decay, 0.8), settings.readings - 1
     if way == L1:
         batch = MiniBatch(min(settings.batch, intervals), nothing)
         # The scale is a factor of the gradient, which Adam does not see.
@@ -216,12 +216,12 @@ def stochastic(models: Any, truth: np.ndarray, seed: int) -> found.Drawn:
 def experiment(settings: Settings, deadline: Deadline, run: Run) -> None:
     """Train and judge, print the table, write metrics and the figures of what is done."""
     print(smaller(settings, FULL), flush=True)
-    best, size = study(settings, run, deadline), 2 * settings.count
+    best, size = study(settings, run, deadline), 2 * settings.readings
     xs = {way: np.asarray(_simulated(models, size)) for way, models in best.items()}
     truth = {name: orbit(start, size) for name, start in STARTS.items()}
     drawn = None
     if POSTERIOR in best:
-        rows = np.repeat(np.array(list(truth.values())), settings.repeats, axis=0)[:, : settings.count]
+        rows = np.repeat(np.array(list(truth.values())), settings.repeats, axis=0)[:, : settings.readings]
         drawn = stochastic(best[POSTERIOR], rows, run.seed)
     regimes = {}
     for i, name in enumerate(STARTS):

@@ -1,11 +1,11 @@
-"""Section 5.4.1: Henon-Heiles learnt with leapfrog, with Runge-Kutta's method of its order, and with one of order 8.
+"""Section 5.4.1: Henon-Heiles learnt with leapfrog, with Runge-Kutta's method of its order, and with one of order 4.
 
     python -m experiments.henon_heiles [--quick] [--out DIR] [--seed N]
 
 Twenty readings of the full state in 100 s, noise 0.05, start known (specification 5.15, E41); nine coefficients and two
-variances learn in steps of 0.25, by `learn`, from zero coefficients, and `sample` draws the posterior. Every learnt
-potential predicts 200 s by leapfrog in steps of 0.01. The truth is DOP853's, not an integrator of ours. Each noise
-realisation leaves a file, and a run that was stopped goes on where it was.
+variances learn in steps of 0.25, those of order 4 in 1.25, by `learn`, from zero coefficients, and `sample` draws the
+posterior. Every learnt potential predicts 200 s by leapfrog in steps of 0.01. The truth is DOP853's, not an integrator
+of ours. Each noise realisation leaves a file, and a run that was stopped goes on where it was.
 
 `H_*` and `tracking_time_*` are of the MAP estimate, as in the dissertation. Beyond it: `stepped_as_learnt` keeps the
 propagator and the steps of the learning, `posterior_mean` takes the mean of the coefficients, `predictive_median` the

@@ -27,6 +27,7 @@ from integrators._splitting import MeanOfCopies as MeanOfCopies
 from integrators._splitting import Composition as Composition
 from integrators._splitting import yoshida4 as yoshida4
 from integrators._splitting import suzuki4 as suzuki4
+from integrators._nystrom_splitting import BlanesMoan4 as BlanesMoan4
 from integrators._runge_kutta import RK2 as RK2
 from integrators._runge_kutta import RK4 as RK4
 from integrators._runge_kutta import ImplicitMidpoint as ImplicitMidpoint

@@ -4,6 +4,8 @@ In reading order: recordings and simulation files, models, objectives, fits, for
 report is in `symplearn.report`, which alone needs matplotlib.
 """
 
+from ._compare_samplers import Comparison as Comparison
+from ._compare_samplers import compare_samplers as compare_samplers
 from ._constrained_fit import ConstrainedEstimate as ConstrainedEstimate
 from ._constrained_fit import fit_constrained as fit_constrained
 from ._distributions import DoubleExponential as DoubleExponential
@@ -41,6 +43,7 @@ from ._hamiltonians import Polynomial as Polynomial
 from ._hamiltonians import PolynomialPotential as PolynomialPotential
 from ._hidden_markov import HiddenMarkovModel as HiddenMarkovModel
 from ._importance import AdaptiveImportance as AdaptiveImportance
+from ._infer import infer as infer
 from ._information import Information as Information
 from ._information import information as information
 from ._inputs import Inputs as Inputs

@@ -96,7 +96,7 @@ def _problems(facts: Diagnostics, drawn: Drawn) -> tuple[str, ...]:
     if not facts.worst_r_hat <= _R_HAT:
         found.append(
             f"The chains disagree: R-hat of {_worst(facts.r_hat)} is {facts.worst_r_hat:.3f}, above {_R_HAT}; draw "
-            "more, or look for a second mode with `TemperedSMC`."
+            "more, or look for a second mode with a wide `TemperedSMC`."
         )
     if not facts.least_ess >= _ESS:
         found.append(f"The draws are worth {facts.least_ess:.0f} independent ones, fewer than {_ESS}; draw more.")

@@ -99,7 +99,8 @@ def start(models: PyTree) -> Place:
     def one(model):
         free = flatten(model)[0]
         size = free.shape[0]
-        return Place(free, jnp.asarray(jnp.inf), jnp.zeros(size), jnp.eye(size), jnp.asarray(0))
+        # Not weakly typed, as no score is that a descent ends with: else the second descent compiles anew.
+        return Place(free, jnp.asarray(jnp.inf, free.dtype), jnp.zeros(size), jnp.eye(size), jnp.asarray(0))
 
     return eqx.filter_vmap(one)(models)
 

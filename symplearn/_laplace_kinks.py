@@ -50,7 +50,8 @@ def end_at_kinks(models: Any, places: Place, task: Task) -> tuple[Place, Array]:
     width = _SNAP * ROUNDING / jnp.where(task.kinks > 0, task.kinks, 1.0)
     zero = (task.kinks > 0) & (jnp.abs(places.free) < width)
     for _ in range(3):
-        moves = jnp.where(zero, 0.0, 1.0)
+        # Of the places' type, not a weak one: a weak one compiles the descent anew.
+        moves = jnp.where(zero, 0.0, jnp.ones_like(places.free))
         places = places._replace(free=jnp.where(zero, 0.0, places.free))
         places = task.descend(models, places, moves, 0.0, EVALUATIONS, task.tolerance)
         loose = zero & (jnp.abs(places.slope) > task.kinks)

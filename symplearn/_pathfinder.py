@@ -31,7 +31,8 @@ class Pathfinder(AbstractBlockSampler):
     `paths` runs of at most `steps` of L-BFGS, by blackjax, start at normal draws about the mode of `reach` times its
     scale. On each the normal with the largest ELBO is taken, and `draws` are drawn of their mixture and **importance
     resampled**: with a Pareto k below 0.7 they stand for the density, above it the diagnostics say that they do not. A
-    first look, and a check of the Laplace approximation.
+    first look, and a check of the Laplace approximation. A mode that no path leads to, or a tail much heavier than a
+    normal one, is missed, and no number here tells.
 
     **Raises:** `InputError` where a number is too small, or no draw has a finite density.
     """

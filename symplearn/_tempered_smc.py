@@ -45,7 +45,7 @@ class TemperedSMC(AbstractBlockSampler):
     """
 
     runs: int = 8
-    lines: int = 128
+    lines: int = 256
     length: int = 8
     thin: int = 4
     keep: float = 0.5

@@ -75,7 +75,8 @@ class VariationalInference(AbstractBlockSampler):
     normal density, `draws` are weighed against the density itself: with a Pareto k below 0.7 the resampled ones stand
     for it, above it the diagnostics say that they do not. Yao et al. (2018), ICML. The ELBO, a lower bound of the log
     evidence whose distance from it is the Kullback-Leibler divergence, is `posterior.drawn.elbo` and in the remarks.
-    **A mode that the normal density does not reach is missed, and no number here tells.**
+    **A mode that the normal density does not reach, or a tail much heavier than its own, is missed, and no number here
+    tells.**
 
     **Raises:** `InputError` where a number is too small, or no draw has a finite density.
     """

@@ -41,13 +41,13 @@ def coefficients(basis):
     return np.array([found.get(term, 0.0) for term in terms])
 
 
-def kept(rng, kind):
+def kept(rng, kind, k):
     """What a realisation's file holds, made up around the truth."""
     said = {
         "process_noise": 1e-6,
         "measurement_noise": 1e-4,
         "converged": True,
-        "settings": experiment.settings(kind, True),
+        "settings": experiment.settings(kind, k, True),
     }
     if kind != "several":
         around = coefficients(case.MONOMIALS) + 1e-3 * rng.normal(size=34)
@@ -66,7 +66,7 @@ def test_the_keys_and_figures_are_written_from_what_was_kept(tmp_path, monkeypat
     for kind in experiment.KINDS:
         for k in range(2):
             path = tmp_path / "quick" / f"seed3_{k:02d}_{kind}.json"
-            path.write_text(json.dumps(kept(rng, kind)), encoding="utf-8")
+            path.write_text(json.dumps(kept(rng, kind, k)), encoding="utf-8")
     experiment.main(["--quick", "--seed", "3", "--out", str(tmp_path)])
     found = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
     assert found.keys() >= KEYS and found["realisations"] == 2
@@ -177,8 +177,7 @@ def test_the_command_learns_from_end_to_end(tmp_path, monkeypatch):
     monkeypatch.setattr(experiment, "FULL", 1)
     monkeypatch.setattr(experiment, "SAMPLERS", {False: AdaptiveImportance(draws=64, target=16, batch=128, rounds=4)})
     monkeypatch.setattr(experiment, "SINGLE", dict.fromkeys(experiment.SINGLE, cheap))
-    monkeypatch.setattr(experiment, "ORDER4", (ig.RK4(), 1))
-    monkeypatch.setattr(experiment, "SEVERAL", {False: (ig.RK4(), 2)})
+    monkeypatch.setattr(experiment, "SEVERAL", {False: [cheap, (ig.RK4(), 1)]})
     experiment.main(["--out", str(tmp_path)])
     found = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
     assert found.keys() >= KEYS

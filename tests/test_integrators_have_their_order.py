@@ -19,8 +19,10 @@ def test_the_error_against_dop853_falls_at_the_stated_order(method, case):
     slope = ig.observed_order(
         case.system, method, case.system.initial, case.duration, steps=steps, reference=jnp.asarray(end)
     )
-    # The next term of the expansion bends the slope by a few per cent at these steps.
-    assert slope == pytest.approx(method.order, abs=0.15)
+    # The next term of the expansion bends the slope by a few per cent at these steps; more where the leading term is
+    # a hundred times smaller than a composition's, as Blanes and Moan's is: on Kepler's orbit the next one then shows.
+    bend = 0.25 if isinstance(method, ig.BlanesMoan4) else 0.15
+    assert slope == pytest.approx(method.order, abs=bend)
 
 
 @pytest.mark.parametrize("problem", CASES)

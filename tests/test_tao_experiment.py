@@ -56,7 +56,7 @@ def test_all_n_at_once_score_as_each_does():
     rows = [tao.Row(0.05, n, 0) for n in (300, 400)]
     settings = TINY._replace(cells=tuple((row.a, row.n) for row in rows), beyond=(), repeats=1)
     together = tao.ensemble(settings, {tao.POSTERIOR: rows}, 0)
-    times, readings = together.recordings
+    times, readings = together.recordings.times, together.recordings.readings
     assert np.isnan(readings[0, 300:]).all() and not np.diff(times[0, 299:]).any()
     first = tao.ensemble(settings, {tao.POSTERIOR: rows[:1]}, 0)
     # SciPy's own error bound: it is asked for a longer solution, and steps otherwise.

@@ -12,7 +12,7 @@ from symplearn._errors import InputError
 from symplearn._sample import sample_density
 from symplearn._tempered_smc import TemperedSMC
 
-SAMPLER = TemperedSMC(lines=256, reach=8.0)
+SAMPLER = TemperedSMC(reach=8.0)
 SHARE, LOG_EVIDENCE = 0.7, 2.5
 
 
@@ -85,11 +85,9 @@ def test_what_cannot_be_tempered_is_said():
         return jnp.where(jnp.max(jnp.abs(x)) < 1e-9, 0.0, -jnp.inf)
 
     with pytest.raises(InputError, match="2 powers led to .* of 1; take more, or a lower `reach`"):
-        drawn(Box(jnp.asarray(0.0)), [1.0, 0.0], TemperedSMC(lines=4, length=4, powers=2, reach=100.0))
+        drawn(Box(jnp.asarray(0.0)), [1.0, 0.0], TemperedSMC(lines=4, length=4, thin=1, powers=2, reach=100.0))
     with pytest.raises(InputError, match="None of the first 8 particles .* lower the `reach`"):
-        drawn(
-            lambda x: jnp.where(jnp.max(jnp.abs(x)) < 1e-9, 0.0, -jnp.inf), [0.0, 0.0], TemperedSMC(lines=4, length=2)
-        )
+        drawn(needle, [0.0, 0.0], TemperedSMC(lines=4, length=2, thin=1))
     for wrong, sentence in (
         (lambda: TemperedSMC(keep=1.0), "`keep` between 0 and 1, but was given 1.0"),
         (lambda: TemperedSMC(reach=0.0), "`reach` and `dof` above 0, but was given 0.0"),
