@@ -81,8 +81,10 @@ class SideBySide(MarginalLikelihood):
         return jnp.sum(jax.vmap(lambda one: self.score(model, one))(stacked))
 
 
-def model(integrator: ig.AbstractIntegrator, substeps: int, basis: AbstractBasis = MONOMIALS) -> StateSpaceModel:
-    """All 34 cubic terms, their coefficients zero, and both variances to learn.
+def model(
+    integrator: ig.AbstractIntegrator, substeps: int, basis: AbstractBasis = MONOMIALS, noise: Any = None
+) -> StateSpaceModel:
+    """All 34 cubic terms, their coefficients zero, and both variances to learn, unless another noise is given.
 
     With monomials the start is known, as in section 5.4.1; with Legendre polynomials only its reading is.
     """
@@ -90,7 +92,7 @@ def model(integrator: ig.AbstractIntegrator, substeps: int, basis: AbstractBasis
         dynamics=Propagator(Polynomial(2, 3, None, basis), integrator, substeps),
         observation=FullState(),
         process_noise=AdditiveGaussian(ScaledIdentity(Positive(1e-4), 4)),
-        measurement_noise=AdditiveGaussian(ScaledIdentity(Positive(1e-4), 4)),
+        measurement_noise=AdditiveGaussian(ScaledIdentity(Positive(1e-4), 4)) if noise is None else noise,
         initial=Gaussian(jnp.asarray(START), 1e-8 * jnp.eye(4)) if isinstance(basis, Monomials) else None,
     )
 

@@ -27,10 +27,11 @@ NAMES = {
     "symplectic": "Tao",
     "rk2": "Runge-Kutta 2",
     "order4_step_8_times_larger": "order 4,\n8 times the step",
-    "bayes": "mean of draws",
+    "bayes": "draws'\nmean",
     "map": "MAP",
-    "map_order4_step_40_times_larger": "MAP, order 4,\n40 times the step",
-    "ls": "least squares",
+    "map_order4_step_40_times_larger": "MAP,\norder 4,\nlarge\nsteps",
+    "map_multiplicative_noise": "MAP,\nnoise\nas it is",
+    "ls": "least\nsquares",
 }
 
 
@@ -57,7 +58,7 @@ def hamiltonians(results: dict[str, list[dict[str, Any]]]) -> Figure:
         panel.axhline(true_energy(), color="black", ls="--", label="truth")
         panel.axvline(READ_UNTIL, color="magenta", lw=1)
         panel.set(title=f"learnt with {NAMES[name]}", xlabel="t (s)")
-        panel.legend(loc="upper right")
+        panel.legend(loc="center right")
     panels[0].set_ylabel("H")
     return figure
 
@@ -131,7 +132,7 @@ def testing(one: dict[str, Any]) -> Figure:
 
 def spreads(results: dict[str, list[dict[str, Any]]], published: dict[str, float]) -> Figure:
     """What one lucky seed hides: the errors of one recording and the horizons of several, in every realisation."""
-    figure = Figure(figsize=(16, 4.8), layout="constrained")
+    figure = Figure(figsize=(17, 5), layout="constrained")
     panels = figure.subplots(1, 4)
     for panel, key in zip(panels, ("e_train", "e_test", "H"), strict=False):
         values = {name: [one[key] for one in results[name]] for name in COLOURS}
@@ -142,8 +143,9 @@ def spreads(results: dict[str, list[dict[str, Any]]], published: dict[str, float
         panel.set_yscale("log")
     parts = {"bayes": "mean", "map": "map", "map_order4_step_40_times_larger": "order4", "ls": "ls"}
     values = {name: [one[part]["horizon"] for one in results["several"]] for name, part in parts.items()}
-    _dots(panels[3], values, {name: published.get(f"horizon_{name}") for name in parts})
-    panels[3].set_title(f"horizon (s), several recordings, at most {HORIZON:g}")
+    values = {"map_multiplicative_noise": [one["horizon"] for one in results["several_multiplicative"]]} | values
+    _dots(panels[3], values, {name: published.get(f"horizon_{name}") for name in values})
+    panels[3].set_title(f"horizon (s, at most {HORIZON:g}), several")
     return figure
 
 

@@ -184,14 +184,15 @@ def draw(regimes: dict[str, Regime]) -> Figure:
             if regime.drawn is not None:
                 draws = regime.drawn.learnt[one, :30, :, i].T
                 row[i].plot(times[: len(draws)], draws, color="tab:blue", alpha=0.08, linewidth=0.6)
-            row[i].plot(times, truth[:, i], color="0.3", linewidth=2.0, label="truth")
+            row[i].plot(times, truth[:, i], color="0.3", linewidth=2.0)
             for way, xs in regime.runs.items():
-                row[i].plot(times, xs[one, :, i], color=COLOURS[way], linewidth=1.0, label=way)
+                row[i].plot(times, xs[one, :, i], color=COLOURS[way], linewidth=1.0)
             row[i].axvline(times[len(times) // 2], color="0.8", linewidth=1.0)
             limit = 1.5 * np.abs(truth[:, i]).max()
-            row[i].set(title=f"{name}: q{i + 1} in rad; data end at the line", xlabel="time in s", ylim=(-limit, limit))
+            row[i].set(title=f"{name}: q{i + 1} in rad, truth grey; data end at the line", xlabel="time in s")
+            row[i].set_ylim(-limit, limit)
         for way, xs in regime.runs.items():
-            row[2].semilogy(times, _off(xs[one], truth).clip(1e-6), color=COLOURS[way], linewidth=1.0, label=way)
+            row[2].semilogy(times, _off(xs[one], truth).clip(1e-3), color=COLOURS[way], linewidth=1.0, label=way)
         row[2].set(title=f"{name}: absolute Hamiltonian error", xlabel="time in s")
         row[2].legend(fontsize=8)
     return figure

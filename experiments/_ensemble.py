@@ -129,7 +129,11 @@ def smaller(settings: Any, full: Any, **counts: tuple[int, int]) -> str:
     if settings == full:
         return ""
     numbers = {name: (each, getattr(full, name)) for name, each in settings._asdict().items() if isinstance(each, int)}
-    parts = [f"{name} {own} of {whole}" for name, (own, whole) in (counts | numbers).items() if own != whole]
+    parts = [
+        f"{name.replace('_', ' ')} {own} of {whole}"
+        for name, (own, whole) in (counts | numbers).items()
+        if own != whole
+    ]
     return f"SMALLER than the published study: {', '.join(parts)}. No number is the full run's.\n"
 
 

@@ -35,26 +35,30 @@ class TemperedSMC(AbstractBlockSampler):
     larger `reach`.
 
     At each power `lines` particles are resampled, and each walks `length` - 1 times `thin` steps, of which every
-    `thin`-th makes a particle (waste-free: Dau and Chopin 2022, JRSS B 84). A step is the difference of two particles,
-    scaled to an acceptance of 23.4 %, or whole, which leads from mode to mode (ter Braak 2006, Stat. Comput. 16).
-    Particles of one line stay side by side, so that the effective sample size knows their kinship, and R-hat compares
-    the runs. The evidence is the mean of the runs', its standard error their spread's.
+    `thin`-th makes a particle (waste-free: Dau and Chopin 2022, JRSS B 84); None is as many as there are parameters.
+    **Walks that are too short leave all runs the same error, which R-hat does not see**: the evidence then moves with
+    `length`. A step is the difference of two particles, scaled to an acceptance of 23.4 %, or whole,
+    which leads from mode to mode (ter Braak 2006, Stat. Comput. 16). Particles of one line stay side by side, so that
+    the effective sample size knows their kinship, and R-hat compares the runs. The evidence is the mean of the runs',
+    its standard error their spread's.
 
     **Raises:** `InputError` where a number is out of its range, no first particle has a finite density, or `powers`
     do not lead to the density.
     """
 
     runs: int = 8
-    lines: int = 256
-    length: int = 8
-    thin: int = 4
+    lines: int = 128
+    length: int = 16
+    thin: int | None = None
     keep: float = 0.5
     reach: float = 4.0
     dof: float = 4.0
     powers: int = 200
 
     def __check_init__(self):
-        refuse_counts(self, runs=2, lines=4, length=2, thin=1, powers=1)
+        refuse_counts(self, runs=2, lines=4, length=2, powers=1)
+        if self.thin is not None:
+            refuse_counts(self, thin=1)
         if not 0 < self.keep < 1:
             raise InputError(f"`TemperedSMC` needs `keep` between 0 and 1, but was given {self.keep}.")
         if not (self.reach > 0 and self.dof > 0):
@@ -73,7 +77,7 @@ class TemperedSMC(AbstractBlockSampler):
         if not np.all(power == 1.0):
             raise InputError(f"{self.powers} powers led to {np.min(power):.2g} of 1; take more, or a lower `reach`.")
         evidences, rounds = np.asarray(end.log_evidence), np.asarray(end.rounds)
-        moves = self.lines * (self.length - 1) * self.thin
+        moves = self.lines * (self.length - 1) * (self.thin or start.centre.size)
         return Drawn(
             start.free(end.z),
             end.log_density - start.log_volume,
@@ -234,7 +238,7 @@ def _moved(options, log_density, particles, power, weights, resample_key, move_k
             state, info = kernel.step(key, state)
             return state, info.acceptance_rate
 
-        state, accepted = jax.lax.scan(once, state, jax.random.split(key, options.thin))
+        state, accepted = jax.lax.scan(once, state, jax.random.split(key, options.thin or size))
         return state, (state.position, state.logdensity, jnp.mean(accepted))
 
     def line(z, height, key):

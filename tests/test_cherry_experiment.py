@@ -22,7 +22,7 @@ experiment = importlib.import_module("experiments.cherry")
 KEYS = {
     "e_train_symplectic", "e_test_symplectic", "e_train_rk2", "e_test_rk2", "H_true", "H_symplectic", "H_rk2",
     "horizon_bayes", "horizon_ls", "e_test_order4_step_8_times_larger", "horizon_map_order4_step_40_times_larger",
-    "beyond", "published", "seed", "quick",
+    "horizon_map_multiplicative_noise", "horizon_expected", "beyond", "published", "seed", "quick",
 }  # fmt: skip
 FIGURES = ("hamiltonians", "reconstructions", "training", "testing", "spreads")
 
@@ -49,12 +49,19 @@ def kept(rng, kind, k):
         "converged": True,
         "settings": experiment.settings(kind, k, True),
     }
-    if kind != "several":
+    if kind in experiment.SINGLE:
         around = coefficients(case.MONOMIALS) + 1e-3 * rng.normal(size=34)
         return experiment.judged(around, case.MONOMIALS) | said | {"draws": []}
+    if kind == "several_multiplicative":
+        return experiment.judged(coefficients(case.LEGENDRE), case.LEGENDRE) | said
     drawn = coefficients(case.LEGENDRE) + 1e-4 * rng.normal(size=(4, 34))
     parts = {part: experiment.judged(drawn[i], case.LEGENDRE) | said for i, part in enumerate(("ls", "order4", "map"))}
-    return parts | experiment._predictive(drawn) | said | {"draws": drawn.tolist(), "posterior_converged": True}
+    return (
+        parts
+        | experiment._predictive(drawn)
+        | said
+        | {"draws": drawn.tolist(), "posterior_converged": True, "expected": 20.0}
+    )
 
 
 def test_the_keys_and_figures_are_written_from_what_was_kept(tmp_path, monkeypatch, capsys):
@@ -177,10 +184,11 @@ def test_the_command_learns_from_end_to_end(tmp_path, monkeypatch):
     monkeypatch.setattr(experiment, "FULL", 1)
     monkeypatch.setattr(experiment, "SAMPLERS", {False: AdaptiveImportance(draws=64, target=16, batch=128, rounds=4)})
     monkeypatch.setattr(experiment, "SINGLE", dict.fromkeys(experiment.SINGLE, cheap))
+    monkeypatch.setattr(experiment, "ORDER4", cheap)
     monkeypatch.setattr(experiment, "SEVERAL", {False: [cheap, (ig.RK4(), 1)]})
     experiment.main(["--out", str(tmp_path)])
     found = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
     assert found.keys() >= KEYS
     # Of one noise realisation; RK2 in steps of 0.4 is coarse, but the published horizon of least squares is 1.5 s.
     assert found["horizon_bayes"]["median"] > 3 * found["horizon_ls"]["median"]
-    assert len(list((tmp_path / "full").glob("seed0_00_*.json"))) == 4
+    assert len(list((tmp_path / "full").glob("seed0_00_*.json"))) == len(experiment.KINDS)

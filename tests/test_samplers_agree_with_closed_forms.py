@@ -33,7 +33,7 @@ SAMPLERS = [
     DRAM(chains=8, steps=3000, thin=3, shrinkage=0.25, scout=SCOUT),
     DRAM(blocks=((0,), (1,)), chains=8, steps=4000, thin=4, shrinkage=0.25, scout=SCOUT),
     MCLMC(chains=8, draws=1000, scout=SCOUT),
-    TemperedSMC(lines=128, thin=2),
+    TemperedSMC(length=8, thin=2),
 ]
 NAMES = ["importance", "random walk", "NUTS", "DRAM", "DRAM within Gibbs", "MCLMC", "tempered SMC"]
 

@@ -12,7 +12,7 @@ from symplearn._errors import InputError
 from symplearn._sample import sample_density
 from symplearn._tempered_smc import TemperedSMC
 
-SAMPLER = TemperedSMC(reach=8.0)
+SAMPLER = TemperedSMC(lines=256, length=8, thin=4, reach=8.0)
 SHARE, LOG_EVIDENCE = 0.7, 2.5
 
 
@@ -69,9 +69,24 @@ def test_impossible_places_weigh_nothing():
     assert off_by(x.mean(axis=1), math.sqrt(2 / math.pi)) < 3.0
 
 
+@pytest.mark.slow
+def test_walks_are_long_enough_for_ten_parameters():
+    """By default the walks grow with the parameters: variances and evidence are right for ten with kinks and tails."""
+
+    def kinked(x):
+        return -0.5 * jnp.sum(x[:5] ** 2) - jnp.sum(jnp.abs(x[5:]))
+
+    posterior = drawn(kinked, 10 * [0.1], TemperedSMC())
+    assert posterior.converged, str(posterior)
+    squares = np.mean(np.asarray(posterior.values["x"]) ** 2, axis=1)
+    assert off_by(squares[:, :5].mean(axis=1), 1.0) < 3.0 and off_by(squares[:, 5:].mean(axis=1), 2.0) < 3.0
+    assert abs(posterior.log_evidence - 2.5 * math.log(2 * math.pi) - 5 * math.log(2)) < 3 * posterior.log_evidence_sd
+    assert posterior.log_evidence_sd < 0.15  # 8 runs; without it the line before could not fail
+
+
 def test_runs_that_lose_a_mode_disagree():
     """A budget too small for the second mode, which some runs find and others do not, is not called converged."""
-    small = TemperedSMC(lines=32, reach=4.0)
+    small = TemperedSMC(lines=32, length=8, thin=4, reach=4.0)
     posterior = drawn(TwoModes(jnp.asarray([5.0, 5.0]), jnp.asarray(0.5)), [-5.0, -5.0], small)
     shares = (np.asarray(posterior.values["x"])[..., 0] > 0).mean(axis=1)
     assert shares.min() == 0.0 and shares.max() > 0.5
