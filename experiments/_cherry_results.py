@@ -103,6 +103,7 @@ def _compared(what: str, new: np.ndarray, old: np.ndarray, before: str, lower: b
 
 
 def report(found: dict[str, Any], quick: bool) -> None:
+    """The table, the published numbers beside ours, and what helps."""
     rows: list[Sequence[Any]] = [["quantity", "published (one draw)", "median", "quartiles"]]
     for key in sorted(found):
         if isinstance(found[key], dict) and "median" in found[key]:
@@ -116,4 +117,7 @@ def report(found: dict[str, Any], quick: bool) -> None:
     for sentence in found["beyond"].values():
         print(f"Beyond: {sentence}.")
     if quick:
-        print("quick: several recordings are learnt by order 4 in steps of 0.4 alone, and drawn coarser")
+        print(
+            "quick: several recordings are learnt by order 4 in steps of 0.4 alone, descents end within 0.01 nats, "
+            "and draws are fewer"
+        )
