@@ -39,11 +39,13 @@ def refuse_unlearnable(model: Any, several: Sequence[TimeSeries], verb: str) -> 
 
 
 def _state_size(model: Any, several: Sequence[TimeSeries]) -> int:
-    """The size of the initial mean; without one, the state is what is read."""
+    """The size of the initial mean, or of the means of segments; without one, the state is what is read."""
     initial = model.initial[0] if isinstance(model.initial, tuple) else model.initial
     if initial is None:
         return several[0].readings.shape[1]
-    return int(np.shape(getattr(initial.mean, "value", initial.mean))[0])
+    centre: Any = getattr(initial, "mean", None)
+    centre = initial.means if centre is None else centre
+    return int(np.shape(getattr(centre, "value", centre))[-1])
 
 
 def _refuse_terms(model: Any, several: Sequence[TimeSeries]) -> None:

@@ -148,6 +148,7 @@ def of_a_user(stiffness):
     )
 
 
+@pytest.mark.slow
 def test_a_module_of_the_user_is_learnt():
     """A Hamiltonian that is no polynomial of ours, read in one coordinate, is learnt from a start that is far off."""
 

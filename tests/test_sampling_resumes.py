@@ -83,7 +83,7 @@ def every_block(monkeypatch):
 
 
 # The others are driven in the same ways.
-FAST = ("importance", "random walk", "NUTS")
+FAST = ("importance", "random walk")
 FAST_FIRST = [*FAST, *(pytest.param(name, marks=pytest.mark.slow) for name in SAMPLERS if name not in FAST)]
 
 
