@@ -1,12 +1,11 @@
 """What is told of `cherry`: the metrics, what helps beyond the dissertation, and the table."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ._cherry_case import HORIZON, LARGEST_ERROR, true_energy
-from ._command import print_table
+from ._realisations import print_spreads, spread
 
 SEVERAL = ("several", "several_multiplicative")
 PUBLISHED = {
@@ -21,13 +20,6 @@ PUBLISHED = {
 }
 # Something helps that is better in three realisations of four.
 _MOST = 0.75
-
-
-def spread(values: Sequence[float]) -> dict[str, float]:
-    """Median, quartiles and extremes."""
-    lower, middle, upper = np.quantile(values, [0.25, 0.5, 0.75])
-    ends = {"smallest": float(np.min(values)), "largest": float(np.max(values))}
-    return {"median": float(middle), "lower_quartile": float(lower), "upper_quartile": float(upper), **ends}
 
 
 def metrics(results: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
@@ -104,13 +96,7 @@ def _compared(what: str, new: np.ndarray, old: np.ndarray, before: str, lower: b
 
 def report(found: dict[str, Any], quick: bool) -> None:
     """The table, the published numbers beside ours, and what helps."""
-    rows: list[Sequence[Any]] = [["quantity", "published (one draw)", "median", "quartiles"]]
-    for key in sorted(found):
-        if isinstance(found[key], dict) and "median" in found[key]:
-            one = found[key]
-            quartiles = f"{one['lower_quartile']:.4g} .. {one['upper_quartile']:.4g}"
-            rows.append([key, PUBLISHED.get(key, ""), one["median"], quartiles])
-    print_table(*rows)
+    print_spreads(found, PUBLISHED)
     print(f"true H = {found['H_true']:.5f}; {found['realisations']} noise realisations; horizons end at {HORIZON:g} s")
     escaped = {key: number for key, number in found.items() if key.startswith("escaped_until")}
     print(f"predictions that escaped before 16 s, their e_test told as {LARGEST_ERROR:g}: {escaped}")

@@ -1,12 +1,11 @@
 """What the noise realisations of `henon_heiles` come to: spreads, what helps beyond the dissertation, and the table."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from ._command import print_table
 from ._henon_heiles_case import ENERGY, HORIZON, PROPAGATORS
+from ._realisations import print_spreads, spread
 
 PUBLISHED = {
     "H_symplectic": 0.1219,
@@ -55,13 +54,6 @@ BEYOND = {
     ),
 }
 _ORDER_4 = "order4_step_5_times_larger"
-
-
-def spread(values: Sequence[float]) -> dict[str, float]:
-    """Median, quartiles and extremes."""
-    lower, middle, upper = np.quantile(values, [0.25, 0.5, 0.75])
-    ends = {"smallest": float(np.min(values)), "largest": float(np.max(values))}
-    return {"median": float(middle), "lower_quartile": float(lower), "upper_quartile": float(upper), **ends}
 
 
 def metrics(results: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
@@ -113,13 +105,7 @@ def slopes(propagator: str, merged: bool = False) -> int:
 
 def report(found: dict[str, Any], quick: bool) -> None:
     """Print the published numbers beside ours, and what helps."""
-    rows: list[Sequence[Any]] = [["quantity", "published (one draw)", "median", "quartiles"]]
-    for key in sorted(found):
-        if isinstance(found[key], dict) and "median" in found[key]:
-            one = found[key]
-            quartiles = f"{one['lower_quartile']:.4g} .. {one['upper_quartile']:.4g}"
-            rows.append([key, PUBLISHED.get(key, ""), one["median"], quartiles])
-    print_table(*rows)
+    print_spreads(found, PUBLISHED)
     print(f"true H = {found['H_true']:.4f}; {found['realisations']} noise realisations; tracking ends at {HORIZON:g} s")
     _say_what_helps(found)
     if quick:

@@ -17,7 +17,6 @@ a draw stays with the MAP in the median: what the posterior itself expects of th
 Each noise realisation leaves a file, and a run that was stopped goes on where it was.
 """
 
-import json
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -59,6 +58,7 @@ from ._cherry_case import (
 from ._cherry_figures import draw
 from ._cherry_results import metrics, report
 from ._command import Run, command
+from ._realisations import kept
 
 DRAWS = 50
 QUICK, FULL = 5, 20
@@ -202,18 +202,7 @@ def _sampler(kind: str, k: int, quick: bool) -> AdaptiveImportance | None:
 
 def realisation(run: Run, kind: str, k: int) -> dict[str, Any]:
     """One realisation's results, from its file if there is one."""
-    path = run.out / ("quick" if run.quick else "full") / f"seed{run.seed}_{k:02d}_{kind}.json"
-    wanted = settings(kind, k, run.quick)
-    if path.exists():
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        if kept.get("settings") == wanted:
-            return kept
-    found = learnt(run, kind, k) | {"settings": wanted}
-    path.parent.mkdir(exist_ok=True)
-    unfinished = path.with_suffix(".part")
-    unfinished.write_text(json.dumps(found), encoding="utf-8")
-    unfinished.replace(path)  # whole or not at all
-    return found
+    return kept(run, kind, k, settings(kind, k, run.quick), lambda: learnt(run, kind, k))
 
 
 def experiment(run: Run) -> None:

@@ -13,7 +13,6 @@ median of the draws' predictions, and `expected` is how long a draw stays with t
 itself expects of the MAP.
 """
 
-import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -46,6 +45,7 @@ from ._henon_heiles_case import (
 )
 from ._henon_heiles_figures import View, hamiltonians, phases, spreads, trajectories, variances
 from ._henon_heiles_results import PUBLISHED, metrics, report
+from ._realisations import kept
 
 DRAWS = 200
 QUICK, FULL = 5, 20
@@ -141,20 +141,12 @@ def settings(propagator: str, quick: bool) -> str:
 
 def realisation(run: Run, propagator: str, k: int) -> dict[str, Any]:
     """One realisation's results, from its file if there is one."""
-    # A quick run draws fewer samples, so its files are its own.
-    path = run.out / ("quick" if run.quick else "full") / f"seed{run.seed}_{k:02d}_{propagator}.json"
-    wanted = settings(propagator, run.quick)
-    if path.exists():
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        if kept.get("settings") == wanted:
-            return kept
-    key = jax.random.fold_in(jax.random.key(run.seed), k)
-    found = learnt(propagator, recording(run.seed, k), SAMPLERS[run.quick], key) | {"settings": wanted}
-    path.parent.mkdir(exist_ok=True)
-    unfinished = path.with_suffix(".part")
-    unfinished.write_text(json.dumps(found), encoding="utf-8")
-    unfinished.replace(path)  # whole or not at all
-    return found
+
+    def make() -> dict[str, Any]:
+        key = jax.random.fold_in(jax.random.key(run.seed), k)
+        return learnt(propagator, recording(run.seed, k), SAMPLERS[run.quick], key)
+
+    return kept(run, propagator, k, settings(propagator, run.quick), make)
 
 
 def experiment(run: Run) -> None:

@@ -1,0 +1,43 @@
+"""Noise realisations: each leaves a file, so that a run that was stopped goes on, and together they are a spread."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ._command import Run, print_table
+
+
+def kept(run: Run, name: str, k: int, settings: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Realisation k under `name`: from its file, or made and put there. A file of other `settings` is made anew."""
+    # A quick run draws fewer samples, so its files are its own.
+    path = run.out / ("quick" if run.quick else "full") / f"seed{run.seed}_{k:02d}_{name}.json"
+    if path.exists():
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if found.get("settings") == settings:
+            return found
+    found = make() | {"settings": settings}
+    path.parent.mkdir(exist_ok=True)
+    unfinished = path.with_suffix(".part")
+    unfinished.write_text(json.dumps(found), encoding="utf-8")
+    unfinished.replace(path)  # whole or not at all
+    return found
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Median, quartiles and extremes."""
+    lower, middle, upper = np.quantile(values, [0.25, 0.5, 0.75])
+    ends = {"smallest": float(np.min(values)), "largest": float(np.max(values))}
+    return {"median": float(middle), "lower_quartile": float(lower), "upper_quartile": float(upper), **ends}
+
+
+def print_spreads(found: Mapping[str, Any], published: Mapping[str, float]) -> None:
+    """A table of the spreads among the metrics, the published numbers beside them."""
+    rows: list[Sequence[Any]] = [["quantity", "published (one draw)", "median", "quartiles"]]
+    for key in sorted(found):
+        if isinstance(found[key], dict) and "median" in found[key]:
+            one = found[key]
+            quartiles = f"{one['lower_quartile']:.4g} .. {one['upper_quartile']:.4g}"
+            rows.append([key, published.get(key, ""), one["median"], quartiles])
+    print_table(*rows)
