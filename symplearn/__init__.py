@@ -17,6 +17,10 @@ from ._distributions import Uniform as Uniform
 from ._doubled import DoubledPropagator as DoubledPropagator
 from ._doubled import doubled as doubled
 from ._dram import DRAM as DRAM
+from ._dram import blocks_of as blocks_of
+from ._dram_sweep import DRAMInfo as DRAMInfo
+from ._dram_sweep import DRAMState as DRAMState
+from ._dram_sweep import dram as dram
 from ._dynamic_modes import dmd as dmd
 from ._dynamic_modes import total_dmd as total_dmd
 from ._errors import InputError as InputError

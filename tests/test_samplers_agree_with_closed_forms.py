@@ -10,7 +10,7 @@ import pytest
 from estimation_cases import linear_system, simulate
 
 from symplearn._arviz import arviz
-from symplearn._dram import DRAM, blocks_of, second_stage
+from symplearn._dram import DRAM, blocks_of
 from symplearn._errors import InputError
 from symplearn._fit import Estimate, fit
 from symplearn._importance import AdaptiveImportance
@@ -196,25 +196,3 @@ def test_what_is_in_no_block_is_held(conjugate):
     assert np.ptp(free[..., 2]) == 0.0 and np.ptp(free[..., 1]) > 0.0
     with pytest.raises(InputError, match="disjoint places in a vector of 3"):
         sample(estimate, sampler=DRAM(blocks=((0, 3),)), key=jax.random.key(8))
-
-
-def test_second_stage_is_reversible():
-    """Delayed rejection keeps detailed balance with half the squared distance, and not with all of it added (R1)."""
-    x, y1, y2 = np.random.default_rng(0).normal(size=(3, 200)) * np.array([1.0, 2.0, 1.0])[:, None]
-    sd, shrinkage = 2.0, 0.25
-
-    def flow(x, y2, distance):
-        """Log of the rate of x -> y1 refused -> y2 for the target N(0, 1)."""
-        lp, lp1, lp2 = (jnp.asarray(-0.5 * z**2) for z in (x, y1, y2))
-        squares = (jnp.asarray(((y1 - z) / sd) ** 2) for z in (x, y2))
-        ratio = second_stage(lp, lp1, lp2, *(distance * square for square in squares))
-        refusal = np.log1p(-np.exp(np.minimum(lp1 - lp, -1e-12)))
-        proposals = -0.5 * ((y1 - x) / sd) ** 2 - 0.5 * (y2 - x) ** 2 / (shrinkage * sd**2)
-        return np.asarray(lp + proposals + refusal + np.minimum(ratio, 0.0))
-
-    # Where either end would surely go to y1, no second stage is reached.
-    open_ways = (y1**2 > x**2) & (y1**2 > y2**2)
-    assert open_ways.sum() > 50
-    right, released = ((flow(x, y2, c) - flow(y2, x, c))[open_ways] for c in (0.5, -1.0))
-    np.testing.assert_allclose(right, 0.0, atol=1e-10)  # logarithms of size 10: round-off
-    assert np.median(np.abs(released)) > 0.1
