@@ -14,6 +14,7 @@ from contract import check_document, strict_json
 PAGE = (ROOT / "docs" / "diagnose-a-recording.md").read_text(encoding="utf-8")
 LEARNING = (ROOT / "docs" / "learn-a-hamiltonian.md").read_text(encoding="utf-8")
 LIBRARY = (ROOT / "docs" / "marginal-likelihood.md").read_text(encoding="utf-8")
+POSTERIORS = (ROOT / "docs" / "posteriors.md").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
@@ -75,23 +76,28 @@ def test_names_on_the_pages_exist():
     for option in set(re.findall(r"`--([a-z-]+)", PAGE)) - {"no-cache"}:
         assert option.replace("-", "_") in source, option
     assert all(f"`{name}`" in PAGE for name in EFFECTS)
-    for text, home in ((PAGE, ROOT / "docs"), (LIBRARY, ROOT / "docs"), (LEARNING, ROOT / "docs"), (README, ROOT)):
+    pages = [(page.read_text(encoding="utf-8"), page.parent) for page in (ROOT / "docs").glob("*.md")]
+    for text, home in [*pages, (README, ROOT)]:
         for link in re.findall(r"\]\(([^)#]+)\)", text):
             assert (home / link).exists(), link
 
 
 def test_pages_name_no_machine():
     """No absolute path of anybody's machine stands in README or docs."""
-    assert not re.search(r"(?<![\w.~])/(?:home|work|root|Users|tmp)/", README + PAGE + LEARNING + LIBRARY)
+    assert not re.search(r"(?<![\w.~])/(?:home|work|root|Users|tmp)/", README + PAGE + LEARNING + LIBRARY + POSTERIORS)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("page", "said"),
-    [(LIBRARY, ["converged", "FAILED at reading"]), (LEARNING, ["+0.5", "Converged.", "NOT bounded", "Trained"])],
+    [
+        (LIBRARY, ["converged", "FAILED at reading"]),
+        (LEARNING, ["+0.5", "Converged.", "NOT bounded", "Trained"]),
+        (POSTERIORS, ["Converged.", "Choose", "NOT bounded from below", "Scores of 53 readings", "none diverged"]),
+    ],
 )
 def test_python_of_the_library_pages(page, said, checkout):
-    """The Python of "Learn a model" and "Learn a Hamiltonian" runs in order, and what it asserts of itself holds."""
+    """The Python of each page runs in order, and what it asserts of itself holds."""
     folder, places = checkout
     program = "\n".join(blocks(page, "python"))
     done = subprocess.run(
