@@ -46,6 +46,10 @@ class DRAM(AbstractBlockSampler):
         if not 0 < self.shrinkage < 1:
             raise InputError(f"`DRAM` needs `shrinkage` between 0 and 1, but was given {self.shrinkage}.")
 
+    @property
+    def by_place(self) -> bool:
+        return self.blocks is not None
+
     def draw_in(self, course: Course, density: LogDensity, start: Whitening, key: PRNGKeyArray) -> Drawn:
         blocks = checked_blocks(self.blocks, start.centre.size)
         plan = Plan(self.steps // 4, self.steps // self.thin, self.thin)

@@ -51,13 +51,15 @@ class AdaptiveImportance(AbstractBlockSampler):
     draws: int = 4000
     target: int = 2000
     batch: int = 1000
-    rounds: int = 40
-    components: int = 4
-    dof: float = 5.0
+    rounds: int = 60
+    components: int | None = None
+    dof: float | None = None
 
     def __check_init__(self):
-        refuse_counts(self, draws=4 * _HANDS, target=1, batch=16, rounds=1, components=1)
-        if not self.dof > 2:
+        refuse_counts(self, draws=4 * _HANDS, target=1, batch=16, rounds=1)
+        if self.components is not None:
+            refuse_counts(self, components=1)
+        if self.dof is not None and not self.dof > 2:
             raise InputError(f"`AdaptiveImportance` needs `dof` above 2, but was given {self.dof}.")
 
     def draw_in(self, course: Course, density: LogDensity, start: Whitening, key: PRNGKeyArray) -> Drawn:
@@ -181,11 +183,21 @@ def _densities(density, start, z):
 
 def _first(options: AdaptiveImportance, size: int) -> StudentMixture:
     """Components at the mode, of scales from that of the whitening to twice it."""
-    scales = np.linspace(1.0, 2.0, options.components)
-    shares = np.full(options.components, 1.0 / options.components)
+    count = _components(options, size)
+    scales = np.linspace(1.0, 2.0, count)
     return StudentMixture(
-        shares, np.zeros((options.components, size)), scales[:, None, None] * np.eye(size), options.dof
+        np.full(count, 1.0 / count), np.zeros((count, size)), scales[:, None, None] * np.eye(size), _dof(options, size)
     )
+
+
+def _dof(options: AdaptiveImportance, size: int) -> float:
+    # The tails of a t density hold more of its draws the more dimensions there are, unless they are lighter.
+    return max(5.0, float(size)) if options.dof is None else options.dof
+
+
+def _components(options: AdaptiveImportance, size: int) -> int:
+    # Each has a scale matrix to learn, of so many numbers that few draws tell no more than one.
+    return max(1, min(4, 24 // size)) if options.components is None else options.components
 
 
 def _adapted(
@@ -197,23 +209,23 @@ def _adapted(
     random: np.random.Generator,
 ) -> StudentMixture:
     """The next proposal: a wide component over all draws, and a mixture fitted to them."""
-    size, count = z.shape[1], options.components
+    size, count = z.shape[1], _components(options, z.shape[1])
     weights = softened(log_weights, least=5.0 * (size + 1))
     common = np.linalg.cholesky(scatter(z, weights))
     if done <= _FEWEST // 2:
         points = z[random.choice(len(z), size=count, p=weights)]
         begin = StudentMixture(
-            np.full(count, 1.0 / count), points, np.broadcast_to(common, (count, size, size)), options.dof
+            np.full(count, 1.0 / count), points, np.broadcast_to(common, (count, size, size)), _dof(options, size)
         )
     else:
         shares = latest.shares[1:] / latest.shares[1:].sum()
-        begin = StudentMixture(shares, latest.means[1:], latest.roots[1:], options.dof)
+        begin = StudentMixture(shares, latest.means[1:], latest.roots[1:], latest.dof)
     fitted = refined(begin, z, weights, _ITERATIONS)
     return StudentMixture(
         np.concatenate([[_DEFENSIVE], (1 - _DEFENSIVE) * fitted.shares]),
         np.concatenate([(weights @ z)[None], fitted.means]),
         np.concatenate([_STRETCH * common[None], fitted.roots]),
-        options.dof,
+        latest.dof,
     )
 
 

@@ -81,6 +81,11 @@ def information(estimate: Estimate) -> Information:
     return Information(tuple(names), eigenvalues[::-1], vectors.T[::-1], left)
 
 
+def reference_widths(estimate: Estimate) -> np.ndarray:
+    """For each free coordinate (parameter,) the width that its prior, or its size, gives it."""
+    return _references(estimate)[1]
+
+
 def _references(estimate: Estimate) -> tuple[list[str], np.ndarray]:
     """A label and a reference width in the free coordinate, for each free coordinate."""
     names: list[str] = []

@@ -12,6 +12,7 @@ from ._blocks import Course
 from ._checkpoint import Checkpoint, seal_of
 from ._errors import InputError
 from ._fit import Estimate
+from ._funnel import Straightened, bent_back, funnel_of
 from ._importance import AdaptiveImportance
 from ._parameters import flatten
 from ._posterior import Posterior, log_posterior_of, posterior_of
@@ -29,7 +30,8 @@ def sample(
     """Draw from the posterior around an estimate. Dissertation (2.13) to (2.18), Algorithm 3 corrected.
 
     The estimate need not have converged, nor its Hessian be positive definite: the sampler's scale is measured where
-    the Hessian is of no use. Whether the draws can be trusted is in the result: `posterior.converged`.
+    the Hessian is of no use. Where the process noise learns, the posterior is a funnel along it; samplers then walk in
+    coordinates in which that is straight. Whether the draws can be trusted is in the result: `posterior.converged`.
 
     Samplers run in blocks of some seconds. Beyond two seconds progress is told on stderr, every ten. Ctrl-C ends the
     run after its block: the draws so far come back as a posterior that is `stopped` and says so; where there are none
@@ -46,8 +48,15 @@ def sample(
     """
     sampler = AdaptiveImportance() if sampler is None else sampler
     density, centre = log_posterior_of(estimate), flatten(estimate.model)[0]
-    start = whiten(density, centre)
-    return posterior_of(estimate, _drawn(density, start, sampler, key, checkpoint, (density, centre)), str(sampler))
+    known_by = (density, centre)
+    funnel = None if sampler.by_place else funnel_of(estimate, density)
+    if funnel is None:
+        drawn = _drawn(density, whiten(density, centre), sampler, key, checkpoint, known_by)
+    else:
+        straight = Straightened(density, funnel)
+        start = whiten(straight, funnel.centre)
+        drawn = bent_back(_drawn(straight, start, sampler, key, checkpoint, known_by), funnel)
+    return posterior_of(estimate, drawn, str(sampler))
 
 
 def sample_density(

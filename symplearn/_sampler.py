@@ -51,6 +51,11 @@ class Drawn(eqx.Module):
 class AbstractSampler(eqx.Module):
     """A way to draw from a density; its numbers are the options."""
 
+    @property
+    def by_place(self) -> bool:
+        """Whether its options name places of the free vector, so that no other coordinates will do."""
+        return False
+
     @abc.abstractmethod
     def draw(self, density: LogDensity, start: Whitening, key: PRNGKeyArray) -> Drawn:
         """Draws from the density, started at what is known of its mode.
