@@ -1,7 +1,8 @@
 """Noise realisations: each leaves a file, so that a run that was stopped goes on, and together they are a spread."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,18 @@ def kept(run: Run, name: str, k: int, settings: str, make: Callable[[], dict[str
     unfinished.write_text(json.dumps(found), encoding="utf-8")
     unfinished.replace(path)  # whole or not at all
     return found
+
+
+def two_at_a_time(jobs: Sequence[Callable[[], dict[str, Any]]]) -> Iterator[dict[str, Any]]:
+    """What the jobs give, in order. A program of small matrices keeps one core busy. Neighbours should be of different
+    kinds, so that nothing is compiled twice."""
+    with ThreadPoolExecutor(2) as pool:
+        waiting = [pool.submit(job) for job in jobs]
+        try:
+            for one in waiting:
+                yield one.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)  # those under way end, and leave their files
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:

@@ -17,8 +17,8 @@ a draw stays with the MAP in the median: what the posterior itself expects of th
 Each noise realisation leaves a file, and a run that was stopped goes on where it was.
 """
 
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -58,7 +58,7 @@ from ._cherry_case import (
 from ._cherry_figures import draw
 from ._cherry_results import metrics, report
 from ._command import Run, command
-from ._realisations import kept
+from ._realisations import kept, two_at_a_time
 
 DRAWS = 50
 QUICK, FULL = 5, 20
@@ -209,24 +209,13 @@ def experiment(run: Run) -> None:
     """Every kind on every realisation, the metrics, the table and the figures."""
     todo = [(k, kind) for k in range(QUICK if run.quick else FULL) for kind in KINDS]
     results: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
-    for (_, kind), found in zip(run.each("realisations", todo), _two_at_a_time(run, todo), strict=True):
+    made = two_at_a_time([partial(realisation, run, kind, k) for k, kind in todo])
+    for (_, kind), found in zip(run.each("realisations", todo), made, strict=True):
         results[kind].append(found)
     found = metrics(results)
     run.write(found)
     draw(run, results, found)
     report(found, run.quick)
-
-
-def _two_at_a_time(run: Run, todo: Sequence[tuple[int, str]]) -> Iterator[dict[str, Any]]:
-    """The results in order. A program of small matrices keeps one core busy, and neighbours are of other kinds, so that
-    nothing is compiled twice."""
-    with ThreadPoolExecutor(2) as pool:
-        waiting = [pool.submit(realisation, run, kind, k) for k, kind in todo]
-        try:
-            for one in waiting:
-                yield one.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)  # those under way end, and leave their files
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

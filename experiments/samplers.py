@@ -14,6 +14,7 @@ A file is left for each posterior, and a run that was stopped goes on where it w
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -131,7 +132,7 @@ def experiment(run: Run) -> None:
     words, results = eqx.tree_pformat(samplers(run), width=1000), {}
     for name in run.each("posteriors", POSTERIORS):
         prior = eqx.tree_pformat(ZOO[name].prior, short_arrays=False, width=1000)
-        results[name] = kept(run, name, 0, f"{words}, {prior}", lambda name=name: compared(run, name))  # type: ignore[misc]
+        results[name] = kept(run, name, 0, f"{words}, {prior}", partial(compared, run, name))
     run.write(metrics(results))
     run.save(figure(results), "samplers.png")
     report(results, run.quick)
