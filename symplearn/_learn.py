@@ -51,7 +51,8 @@ def learn(
     """The maximum a posteriori model, from a portfolio of starts that the readings themselves suggest.
 
     Starts: what learns of the dynamics as given, disturbed by a tenth (with a `key`), and for `Polynomial` and
-    `PolynomialPotential` also zero, harmonic oscillators, and Hamiltonian least squares. Each goes down twice:
+    `PolynomialPotential` also zero, harmonic oscillators, and Hamiltonian least squares; for `LinearDynamics` of a
+    state that is read, dynamic mode decomposition. Each goes down twice:
     straight, and with the process noise lowered step by step while the measurement noise is held. An impossible start,
     whose trajectory escapes, is passed over. The noises as given need no care: their starts are taken from the
     readings.

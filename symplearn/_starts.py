@@ -15,10 +15,11 @@ from jaxtyping import PRNGKeyArray
 import integrators as ig
 
 from ._descent import coordinates
+from ._dynamic_modes import dmd
 from ._errors import InputError
 from ._hamiltonian_objectives import hamiltonian_least_squares
 from ._hamiltonians import Polynomial, PolynomialPotential, exponents
-from ._model import AbstractAffine, FullState, Propagator, StateSpaceModel
+from ._model import AbstractAffine, FullState, LinearDynamics, Propagator, StateSpaceModel
 from ._noise import (
     AdditiveGaussian,
     Correlated,
@@ -166,8 +167,12 @@ def _hamiltonian(model: Any) -> Any:
 
 
 def coefficient_starts(model: Any, recordings: Sequence[TimeSeries], key: PRNGKeyArray | None) -> dict[str, Any]:
-    """Models that differ in what of the dynamics learns, by name: as given, disturbed, and three for polynomials."""
+    """Models that differ in what of the dynamics learns, by name: as given, disturbed, three for polynomials, and
+    dynamic mode decomposition for a linear map."""
     found = {"as given": model}
+    linear = _from_rows(model, recordings)
+    if linear is not None:
+        found["dynamic mode decomposition"] = linear
     hamiltonian = polynomial_of(model)
     if hamiltonian is not None:
         found["zero"] = _with(model, jnp.zeros(len(hamiltonian.terms)))
@@ -232,6 +237,21 @@ def _from_rates(hamiltonian: Any, model: Any, recordings: Sequence[TimeSeries]) 
     except InputError:
         return None
     return found.coefficients
+
+
+def _from_rows(model: Any, recordings: Sequence[TimeSeries]) -> Any:
+    """The model with the linear map from each row of readings to the next, where the whole state is read."""
+    dynamics = getattr(model, "dynamics", None)
+    if not (isinstance(dynamics, LinearDynamics) and isinstance(model.observation, FullState)):
+        return None
+    matrix = dynamics.A.free if isinstance(dynamics.A, Learnt) else dynamics.A
+    if dynamics.B is not None or not eqx.is_array(matrix):
+        return None
+    try:
+        found = dmd(list(recordings)).A
+    except InputError:
+        return None
+    return eqx.tree_at(lambda m: getattr(m.dynamics.A, "free", m.dynamics.A), model, jnp.asarray(found, dtype=float))
 
 
 def _disturbed(model: Any, key: PRNGKeyArray) -> Any:

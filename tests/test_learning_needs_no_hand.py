@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 from scipy.stats import chi2
 
 import integrators as ig
@@ -14,7 +15,7 @@ from symplearn._evidence import laplace_evidence
 from symplearn._hamiltonians import Legendre, Polynomial, PolynomialPotential
 from symplearn._learn import learn
 from symplearn._log_posterior import negative_log_posterior
-from symplearn._model import Coordinates, FullState, Gaussian, Propagator, StateSpaceModel
+from symplearn._model import Coordinates, FullState, Gaussian, LinearDynamics, Propagator, StateSpaceModel
 from symplearn._noise import AdditiveGaussian, Diagonal, LogVariance, ScaledIdentity, StandardDeviation, WienerIncrement
 from symplearn._objectives import MARGINAL_LIKELIHOOD, TimeSeries
 from symplearn._parameters import Frozen, Learnt, Positive, flatten, resolve
@@ -280,3 +281,24 @@ def test_not_all_noise_is_booked_as_process_noise():
     # Uniform factors have the variance 0.1^2 / 3; readings are missing nothing. Half to twice the deviation is allowed.
     expected = 0.01 / 3 * np.mean([np.square(one.readings).mean() for one in recordings])
     assert 0.25 < found.values()["measurement_noise.structure.variance"] / expected < 4.0
+
+
+def test_a_linear_map_starts_at_the_rows():
+    """Of nearly exact readings of the linear pendulum, `learn` from A = 0 finds what a start at the truth finds."""
+    times = np.linspace(0.0, 4.0, 25)
+    rates = np.array([[0.0, 1.0], [-9.81, 0.0]])
+    true = np.array([expm(rates * t) @ [0.1, -0.5] for t in times])
+    prior = Prior({"dynamics": Laplace(10.0), "process_noise": HalfNormal(1.0), "measurement_noise": HalfNormal(1.0)})
+
+    def model(matrix):
+        noises = (AdditiveGaussian(ScaledIdentity(Positive(1e-6), 2)) for _ in range(2))
+        known = Gaussian(jnp.array([0.1, -0.5]), 1e-10 * jnp.eye(2))
+        return StateSpaceModel(LinearDynamics(Learnt(jnp.asarray(matrix))), FullState(), *noises, known)
+
+    for seed in range(4):
+        series = TimeSeries(times, true + 1e-3 * np.random.default_rng(seed).normal(size=true.shape))
+        found = learn(model(np.zeros((2, 2))), series, prior=prior)
+        best = learn(model(expm(rates / 6.0)), series, prior=prior)
+        assert any(one.coefficients == "dynamic mode decomposition" for one in found.attempts)
+        # Half a nat of the best known, as everywhere.
+        assert found.log_posterior > best.log_posterior - 0.5
