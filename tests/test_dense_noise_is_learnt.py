@@ -48,6 +48,7 @@ def most_probable(sum_of_squares):
     return C @ np.diag(1 / (N - 1 - np.array([3.0, 2.0]))) @ C.T
 
 
+@pytest.mark.slow
 def test_of_exact_readings_the_map_is_the_residuals_covariance():
     """Where the state is read exactly, the MAP is the residuals' covariance, with the Jacobian's small correction."""
     ys, series = recorded(0.0, 0)

@@ -201,6 +201,7 @@ def test_process_noise_alone_spreads_the_map():
         assert np.all(np.abs(filtered.mean()[k - 1] - mean) < 3 * filtered.sd()[k - 1] / np.sqrt(draws))
 
 
+@pytest.mark.slow
 def test_out_of_sample_the_noise_runs_from_the_last_state():
     """Out of sample the paths start at the last filtered mean, or with `state_spread` at draws about it; `forecast`
     has the variance of the latter."""

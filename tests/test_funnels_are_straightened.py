@@ -1,5 +1,6 @@
 """Along the process noise a posterior is a funnel; samplers walk in coordinates in which it is straight."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,7 +43,7 @@ def walk():
     """The estimate of the walk's mean and of its one variance, and its funnel."""
     estimate = estimate_of(ScaledIdentity(Positive(1e-3), 1))
     density = log_posterior_of(estimate)
-    return estimate, density, funnel_of(estimate, density)
+    return estimate, eqx.filter_jit(density), funnel_of(estimate, density)
 
 
 def textbook(variance):
@@ -82,9 +83,10 @@ def test_levels_are_the_conditional_posteriors(walk):
 def test_volume_is_the_jacobians(walk):
     """log_volume is log |det d free / d straight|, at the levels' middle, between levels and beyond the last."""
     _, density, funnel = walk
+    jacobian = jax.jit(jax.jacfwd(funnel.free))
     for s in np.asarray(funnel.levels)[[0, 4]].tolist() + [-60.0, -4.321, 5.0]:
         straight = jnp.array([s, 0.7])
-        exact = np.linalg.slogdet(np.asarray(jax.jacfwd(funnel.free)(straight)))[1]
+        exact = np.linalg.slogdet(np.asarray(jacobian(straight)))[1]
         np.testing.assert_allclose(float(funnel.log_volume(straight)), exact, atol=1e-12)
         expected = density(funnel.free(straight)) + exact
         np.testing.assert_allclose(float(Straightened(density, funnel)(straight)), float(expected), rtol=1e-12)
@@ -94,7 +96,7 @@ def test_draws_come_back(walk):
     """Draws in straight coordinates come back in free ones, with the log density that is there."""
     _, density, funnel = walk
     straight = funnel.centre + 0.3 * jax.random.normal(jax.random.key(0), (2, 3, 2))
-    there = jax.vmap(jax.vmap(Straightened(density, funnel)))(straight)
+    there = jax.jit(jax.vmap(jax.vmap(Straightened(density, funnel))))(straight)
     back = bent_back(Drawn(straight, there, evaluations=0), funnel)
     for chain in range(2):
         for draw in range(3):
@@ -125,6 +127,7 @@ def test_posterior_is_that_of_quadrature(walk):
         assert abs(found.mean() - right) < 3 * float(arviz().mcse(np.ascontiguousarray(found)))
 
 
+@pytest.mark.slow
 def test_several_variances_move_together():
     """Two process noises: the first straight coordinate is along both of their logarithms, the rest is orthogonal."""
     model = StateSpaceModel(

@@ -172,6 +172,7 @@ def swing():
 FINE = np.arange(5.25, 9.1, 0.25)
 
 
+@pytest.mark.slow
 def test_finer_times_have_the_same_noise(swing):
     """Asked for a finer step, the spread at the data's times is the same: noise enters once per data interval."""
     coarse, fine = (

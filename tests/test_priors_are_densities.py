@@ -322,6 +322,7 @@ def test_a_density_of_another_kind_is_refused():
         InverseWishart(4.0, np.ones(2))
 
 
+@pytest.mark.slow
 def test_a_fit_stays_within_the_support():
     """Where BFGS tries values of density zero it turns round; at a border it stops, and says it is no MAP. No NaN."""
     ys = 0.1 * np.random.default_rng(4).normal(size=(30, 2))

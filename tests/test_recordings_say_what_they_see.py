@@ -62,6 +62,7 @@ def test_the_profile_of_a_regression_is_a_parabola(moving):
     np.testing.assert_allclose([profile.lower, profile.upper], best[0, 1] + [-half, half], atol=1e-2 * error)
 
 
+@pytest.mark.slow
 def test_a_variance_that_is_too_small_to_see_is_bounded_from_above_only():
     """Of process noise hidden under measurement noise only an upper bound is told; the measurement noise is bounded."""
     c, s = np.cos(0.3), np.sin(0.3)

@@ -109,7 +109,7 @@ def closed_form(A, H, Q, R, P0, V, ys):
 
 # The others take long to compile, and are held to closed forms above.
 BY_COST = [
-    pytest.param(sampler, id=name, marks=() if name in ("importance", "tempered SMC") else pytest.mark.slow)
+    pytest.param(sampler, id=name, marks=() if name == "importance" else pytest.mark.slow)
     for name, sampler in zip(NAMES, SAMPLERS, strict=True)
     if name != "DRAM within Gibbs"  # its blocks are of two parameters
 ]

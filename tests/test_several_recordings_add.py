@@ -95,6 +95,7 @@ def most_probable_start(ys):
     return np.linalg.solve(information, design.T @ np.linalg.solve(S, ys.ravel()[seen])), information
 
 
+@pytest.mark.slow
 def test_two_starts_are_learnt_together():
     """A fit of two short recordings with learnt initial means finds the generalised least squares of each."""
     given = model(*(Learnt(np.zeros(2)) for _ in MEANS))

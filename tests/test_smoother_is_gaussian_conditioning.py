@@ -99,6 +99,7 @@ def test_an_impulse_shows_where_and_when_it_acted():
     assert found[5, 1] > 5.0
 
 
+@pytest.mark.slow
 def test_a_long_recording_is_smoothed():
     """120,000 readings go through, and the states in the middle are those of the stationary smoother.
 

@@ -22,6 +22,7 @@ CELLS = ((0.0, 300), (0.1, 300))
 TINY = tao.Settings(CELLS, CELLS, (), repeats=2, width=2, epochs=20, depth=2)
 
 
+@pytest.mark.slow
 def test_tiny_run_leaves_the_keys_and_goes_on(tmp_path):
     """A run without time trains nothing and says what is missing; the same command then writes every key."""
     tao.main(["--out", str(tmp_path), "--minutes", "1e-9"], TINY)

@@ -84,6 +84,7 @@ def test_walks_are_long_enough_for_ten_parameters():
     assert posterior.log_evidence_sd < 0.15  # 8 runs; without it the line before could not fail
 
 
+@pytest.mark.slow
 def test_runs_that_lose_a_mode_disagree():
     """A budget too small for the second mode, which some runs find and others do not, is not called converged."""
     small = TemperedSMC(lines=32, length=8, thin=4, reach=4.0)
