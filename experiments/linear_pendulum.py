@@ -9,7 +9,7 @@ errors are those at the times of the readings. Of each method's errors in a cell
 dissertation. Beyond it: the pointwise median of the draws' motions, and the MAP.
 
 Each block of fifty data sets leaves a file, and a run that was stopped goes on where it was. A full run takes some
-seventy minutes of one core.
+seventy minutes of one core, by an estimate from a tenth of it.
 """
 
 from collections.abc import Sequence

@@ -12,8 +12,8 @@ under priors of variances and of standard deviations; with the first reading and
 unknown. Where the joint density has two hills, each is climbed, and its model's error told; and a chain of a thousand
 samples, the dissertation's number, begins at the top of the measurement noise's. The truth is DOP853's.
 
-Blocks of data sets leave files, and a run that was stopped goes on where it was. A full run takes some thirty minutes
-of one core.
+Blocks of data sets leave files, and a run that was stopped goes on where it was. A full run takes
+thirty minutes of one core, by an estimate from a twentieth of it.
 """
 
 from collections.abc import Sequence

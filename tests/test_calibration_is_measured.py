@@ -75,6 +75,7 @@ def test_decay_is_a_geometric_series():
     """Without noise the readings are powers of the factor; with it their variance grows as that of an AR(1)."""
     still = {simulators.MATRIX: 0.9, simulators.PROCESS: 0.0, simulators.ERROR: 0.0}
     times, rows = simulators.decay_recording(still, np.random.default_rng(0))
+    # Round-off of two dozen products.
     np.testing.assert_allclose(rows[:, 0], 0.9**times, rtol=1e-12)
     noisy = still | {simulators.PROCESS: 0.04, simulators.ERROR: 0.01}
     rng = np.random.default_rng(1)
@@ -90,6 +91,7 @@ def test_the_oscillator_is_leapfrogs_own_rotation():
     _, rows = simulators.leapfrog_recording(lambda q: -k * q, (1.0, 0.4), 0.0, 0.0, np.random.default_rng(0))
     angles = np.arccos(1 - k * h**2 / 2) * simulators.STEPS * np.arange(simulators.READINGS)
     expected = np.cos(angles) + 0.4 / np.sqrt(k - k**2 * h**2 / 4) * np.sin(angles)
+    # Round-off of some hundred steps.
     np.testing.assert_allclose(rows[:, 0], expected, atol=1e-12)
 
 
@@ -106,6 +108,7 @@ def test_the_nonlinear_ones_are_their_equations(name):
         return -truth[simulators.STIFFNESS] * q - truth[simulators.CUBIC] * q**3
 
     times, rows = STUDIES[name].record(truth, rng)
+    # SciPy's own bounds, eight digits below what is allowed.
     exact = solve_ivp(lambda t, x: [x[1], force(x[0])], (0, 12), start, "DOP853", times, rtol=1e-10, atol=1e-10).y[0]
     # The phase is off by omega^3 h^2 t / 24, which for omega of 1.5 is 0.03 at the end.
     np.testing.assert_allclose(rows[:, 0], exact, atol=0.05)
@@ -124,6 +127,7 @@ def test_a_model_steps_as_its_simulator(name):
     _, rows = simulators.leapfrog_recording(forces[name], (0.7, 0.2), 0.0, 0.0, np.random.default_rng(0))
     step, x = eqx.filter_jit(resolve(study.model(truth, truth)).dynamics), jnp.array([0.7, 0.2])
     for row in rows[:6]:
+        # Round-off: the same steps, in another order of operations.
         assert float(x[0]) == pytest.approx(row[0], abs=1e-12)
         x = step(x, Interval(jnp.zeros(()), jnp.asarray(simulators.EVERY)))
 
@@ -144,8 +148,10 @@ def test_the_truths_are_closed_forms():
     """The pendulum's is a cosine and a sine; the double well's keeps its energy and passes the barrier."""
     times, omega = np.linspace(0.0, 8.0, 30), np.sqrt(9.81)
     expected = 0.1 * np.cos(omega * times) - 0.5 / omega * np.sin(omega * times)
+    # Round-off of the matrix exponential.
     np.testing.assert_allclose(systems.pendulum_truth(times)[:, 0], expected, atol=1e-12)
     q, p = systems._well_orbit()(np.linspace(0, 30, 500))
+    # SciPy's bound of 1e-12 a step, over some hundred steps, and the interpolant between them.
     np.testing.assert_allclose(p**2 / 2 - q**2 / 2 + q**4 / 4, 0.400025, atol=1e-9)
     assert q.min() < -1.5 and q.max() > 1.5
 

@@ -29,6 +29,7 @@ def test_the_truth_is_the_damped_pendulum():
     """Over one data interval the matrix moves the state as DOP853 moves x'' = -9.81 x - x', and then the input adds."""
     for spacing in (0.1, 0.5):
         start = np.array([0.3, -0.2])
+        # SciPy's own bounds, a tenth of what is allowed.
         end = solve_ivp(
             lambda t, x: [x[1], -9.81 * x[0] - x[1]], (0, spacing), start, method="DOP853", rtol=1e-11, atol=1e-12
         ).y[:, -1]
@@ -44,6 +45,7 @@ def test_data_sets_are_as_described():
     for u in data.inputs[7]:
         angles.append(x[0])
         x = A @ x + np.array([0.0, u])
+    # Round-off of 267 steps.
     np.testing.assert_allclose(data.truth[7], angles, atol=1e-12)
     noise = (data.readings - data.truth) / data.truth.max(axis=1, keepdims=True)
     # 8010 draws: a deviation is known to 0.8 %; four of these.
@@ -59,13 +61,16 @@ def test_errors_are_against_the_noiseless_angle():
     data = case.data_sets(0, 0.1, 0.2, 2)
     many = (np.array([case.truth(0.1)] * 2), np.array([[0.0, 1.0]] * 2), np.array([[1.0, 0.0]] * 2))
     true = case.Systems(*many, np.zeros(2), np.zeros((2, 2)))
+    # The square of the round-off of 401 steps.
     np.testing.assert_allclose(case.mean_squares(true, data), 0.0, atol=1e-24)
     shifted = data._replace(truth=data.truth + np.where(np.arange(401) > 200, 0.1, 0.0))
+    # Round-off: 0.1 squared, times a difference of 1e-14.
     np.testing.assert_allclose(case.mean_squares(true, shifted), [[0.0, 0.0], [0.01, 0.01]], atol=1e-15)
     escaping = true._replace(A=100.0 * true.A)
     assert np.all(np.isinf(case.mean_squares(escaping, data)[1]))
     response = case.impulse_response(true, 6)[0]
     powers = [0.0, *(np.linalg.matrix_power(case.truth(0.1), k)[0, 1] for k in range(5))]
+    # Round-off of five products of numbers below 1.
     np.testing.assert_allclose(response, powers, atol=1e-14)
 
 
@@ -89,6 +94,7 @@ def test_priors_are_over_the_variances():
     process = np.exp(np.asarray(model.process_noise.structure.variances.log_variance.free))
     measurement = np.exp(np.asarray(model.measurement_noise.structure.variance.log_variance.free))
     expected = halfnorm.logpdf(process, scale=1e-3).sum() + halfnorm.logpdf(measurement, scale=1.0)
+    # Round-off of three terms.
     assert float(estimates.PRIOR.log_density(model)) == pytest.approx(float(expected), rel=1e-12)
     assert len(process) == 2 and np.all(np.asarray(model.initial.mean.free) == 0.0)
 
@@ -108,16 +114,19 @@ def test_holding_b_and_h_leaves_a_direction_free():
     v, w = np.array([H[0, 1], -H[0, 0]]), np.array([B[1, 0], -B[0, 0]])
     to = np.eye(2) + 0.7 * np.outer(v, w)
     other = to @ A @ np.linalg.inv(to)
+    # Round-off of two-by-two matrices of order 1.
     np.testing.assert_allclose(to @ B, B, atol=1e-12)
     np.testing.assert_allclose(H @ np.linalg.inv(to), H, atol=1e-12)
     assert np.abs(other - A).max() > 0.1
     for matrix in (A, other):
         form = np.concatenate([H, H @ matrix])
         companion = form @ matrix @ np.linalg.inv(form)
+        # Two inverses, of matrices that are not well conditioned.
         np.testing.assert_allclose(companion, [[0, 1], [-np.linalg.det(A), np.trace(A)]], atol=1e-10)
     model = posterior.ObservableForm(np.array([-0.9, 1.8]), B)
     np.testing.assert_allclose(model.slope(np.zeros(2)), [[0.0, 1.0], [-0.9, 1.8]])
     driven = model(np.array([0.3, 0.2]), Interval(*map(jnp.asarray, (0.0, 0.1, [0.5]))))
+    # Round-off.
     np.testing.assert_allclose(driven, [0.2 + 0.5 * B[0, 0], -0.27 + 0.36 + 0.5 * B[1, 0]], atol=1e-12)
 
 

@@ -87,6 +87,7 @@ def test_volume_is_the_jacobians(walk):
     for s in np.asarray(funnel.levels)[[0, 4]].tolist() + [-60.0, -4.321, 5.0]:
         straight = jnp.array([s, 0.7])
         exact = np.linalg.slogdet(np.asarray(jacobian(straight)))[1]
+        # Both are sums of logarithms of order 10: round-off.
         np.testing.assert_allclose(float(funnel.log_volume(straight)), exact, atol=1e-12)
         expected = density(funnel.free(straight)) + exact
         np.testing.assert_allclose(float(Straightened(density, funnel)(straight)), float(expected), rtol=1e-12)
@@ -101,6 +102,7 @@ def test_draws_come_back(walk):
     for chain in range(2):
         for draw in range(3):
             free = funnel.free(straight[chain, draw])
+            # The same arithmetic in a batch: round-off, of log densities of order 100 times more.
             np.testing.assert_allclose(back.free[chain, draw], free, rtol=1e-13)
             np.testing.assert_allclose(back.log_density[chain, draw], density(free), atol=1e-10)
 
@@ -141,6 +143,7 @@ def test_several_variances_move_together():
     estimate = fit(model, TimeSeries(np.arange(float(COUNT)), readings), prior=PRIOR)
     funnel = funnel_of(estimate, log_posterior_of(estimate))
     axes = np.asarray(funnel.axes)
+    # Round-off.
     np.testing.assert_allclose(axes.T @ axes, np.eye(4), atol=1e-14)
     assert np.sum(np.isclose(axes[:, 0], 0.5**0.5)) == 2 and np.sum(np.isclose(axes[:, 0], 0.0)) == 2
 

@@ -102,6 +102,7 @@ def test_pushing_forward_is_taking_powers():
     """Many matrices pushed at once give what `numpy.linalg.matrix_power` gives of each."""
     many, start = np.random.default_rng(0).normal(size=(5, 2, 2)), np.array([0.3, -0.2])
     expected = [[np.linalg.matrix_power(A, k) @ start for k in range(7)] for A in many]
+    # Round-off of six products.
     np.testing.assert_allclose(case.pushed(many, start, 6), expected, rtol=1e-12)
 
 
@@ -118,6 +119,7 @@ def test_the_baselines_have_their_known_errors(n, sigma, expected):
     for name, known in zip(errors, expected, strict=True):
         if known is not None:
             error = np.std(errors[name], ddof=1) / 10
+            # Four standard errors.
             assert outcome.kept_mean(np.array(errors[name])) == pytest.approx(known, abs=4 * error)
             # The errors are no wider than their mean, so that four standard errors are at most 40 %.
             assert error < 0.15 * known
@@ -153,11 +155,12 @@ def test_noise_realisations_differ_and_come_back():
 @pytest.mark.slow  # compiles learning and sampling: half a minute
 def test_one_data_set_is_learnt_better_than_by_decomposition():
     """Of 40 readings with noise 0.1 the predictive mean is nearer the truth than DMD's motion, which dies out, and the
-    measurement noise is found within four posterior deviations (8 % each)."""
+    measurement noise is found within four of its standard deviations (16 % each)."""
     cell = case.Cell(40, 0.1)
     series = case.recording(case.LINEAR, cell, 0, 0)
     found = experiment.dataset(cell, series, jax.random.key(0), shown=True)
     assert found["converged"] and found["mse_bayes"] < 0.5 * found["mse_dmd"]
+    # 82 draws know a deviation to 8 %, so a variance to 16 %; four of these.
     assert found["measurement_noise"] == pytest.approx(0.01, rel=0.64)
     assert np.shape(found["shown"]["draws"]) == (1000, 2, 2)
     assert found.keys() == kept(cell, np.random.default_rng(0), shown=True).keys()

@@ -21,6 +21,7 @@ def test_systems_and_recordings_are_as_described():
     for u in one.inputs:
         readings.append(one.H @ x + one.D @ u)
         x = x + one.B @ u
+    # Round-off of 117 sums.
     np.testing.assert_allclose(one.readings, readings, atol=1e-12)
     exact = [one.D] + [one.H @ np.linalg.matrix_power(np.eye(5), k) @ one.B for k in range(17)]
     np.testing.assert_array_equal(one.exact, exact)
@@ -48,6 +49,7 @@ def test_a_shorter_recording_is_the_beginning_of_a_longer_one():
     longer, shorter = case.case(1, "large", 0.5, 2, 300), case.case(1, "large", 0.5, 2, 120)
     assert len(shorter.readings) == 137
     np.testing.assert_array_equal(longer.first(120).inputs, shorter.inputs)
+    # Sums of other lengths may be ordered otherwise: round-off.
     np.testing.assert_allclose(longer.first(120).readings, shorter.readings, atol=1e-12)
 
 
@@ -65,6 +67,7 @@ def test_the_error_is_the_largest_singular_value():
     wrong = rng.normal(size=(18, 2, 3))
     row = np.hstack(list(wrong))
     expected = np.sqrt(np.linalg.eigvalsh(row @ row.T)[-1])
+    # Round-off.
     assert case.spectral_error(wrong, np.zeros_like(wrong)) == pytest.approx(expected, rel=1e-12)
 
 
@@ -91,13 +94,15 @@ def test_starts_are_made_of_the_readings_alone():
         float(noise.structure.variance.log_variance.free) for noise in (model.process_noise, model.measurement_noise)
     )
     expected = halfnorm.logpdf(np.exp([0.5 * log_q, 0.5 * log_r])).sum()
+    # Round-off of two terms.
     assert float(estimates.PRIOR.log_density(model)) == pytest.approx(float(expected), rel=1e-12)
     A, B, H = (np.asarray(m) for m in (model.dynamics.A, model.dynamics.B, model.observation.matrix))
     assert A.shape == (5, 5)
     # ERA of order 5 leaves out what the noisy parameters have beyond it.
     assert np.abs(H @ B - blocks[1]).max() < 0.2 * np.abs(blocks[1]).max()
-    at_first = H @ np.asarray(model.initial.mean.free) + one.D * 0 @ one.inputs[17]
+    at_first = H @ np.asarray(model.initial.mean.free)
     seen = one.readings[17] - np.asarray(model.observation.feedthrough) @ one.inputs[17]
+    # A pseudo-inverse of an H whose singular values differ by some decades.
     np.testing.assert_allclose(at_first, seen, atol=1e-8)
 
 

@@ -89,6 +89,7 @@ def test_the_keys_and_figures_are_written_from_what_was_kept(tmp_path, monkeypat
 def test_the_truth_is_the_nonlinear_pendulum():
     """The true motion keeps its energy, and comes back after the period 4 K(sin(2.5 / 2)) / sqrt(g) (3.4 s)."""
     q, p = case.NONLINEAR.states(np.linspace(0.0, 8.0, 50)).T
+    # SciPy's bound of 1e-12 a step, over some hundred steps, and the interpolant between them.
     np.testing.assert_allclose(0.5 * p**2 - 9.81 * np.cos(q), -9.81 * np.cos(2.5), atol=1e-9)
     period = 4 * ellipk(np.sin(1.25) ** 2) / 9.81**0.5  # SciPy's argument is the modulus squared
     # The interpolant between DOP853's steps is of order 7.
@@ -106,6 +107,7 @@ def test_the_baselines_have_their_known_errors(n, expected):
             errors[name].append(case.squared_error(case.pushed(A, case.NONLINEAR.start, n), true))
     for name, known in zip(errors, expected, strict=True):
         error = np.std(errors[name], ddof=1) / 60**0.5
+        # Four standard errors, at most a fifth of the number, by the next line.
         assert outcome.kept_mean(np.array(errors[name])) == pytest.approx(known, abs=4 * error)
         assert error < 0.05 * known
 
