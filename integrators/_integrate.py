@@ -106,7 +106,7 @@ def advance(
     substeps: int = 1,
 ) -> Float[Array, " n"]:
     """The integrator's own state after `substeps` equal steps from `t0` to `t1`. Not jitted."""
-    dt = (t1 - t0) / substeps
+    dt, system = (t1 - t0) / substeps, system.prepared()
 
     def one(state: Float[Array, " n"], count: Array) -> tuple[Float[Array, " n"], None]:
         return integrator.step(system, state, t0 + count * dt, dt), None
@@ -127,8 +127,10 @@ def strongly_typed(tree: Any) -> Any:
 
 @eqx.filter_jit
 def _integrate(system: System, integrator: AbstractIntegrator, x0: Array, ts: Array, substeps: int) -> Trajectory:
+    prepared = system.prepared()
+
     def interval(state: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        state = advance(system, integrator, state, *ends, substeps)
+        state = advance(prepared, integrator, state, *ends, substeps)
         return state, integrator.project(state)
 
     _, later = jax.lax.scan(interval, integrator.lift(x0), (ts[:-1], ts[1:]))

@@ -56,6 +56,13 @@ class AbstractHamiltonian(eqx.Module):
         """The system as it stands at time `t`. A time-dependent one returns a copy with its time replaced."""
         return self
 
+    def prepared(self) -> "AbstractHamiltonian":
+        """The same system with all worked out that its parameters alone determine; asked for once, before many steps.
+
+        Override it where derivatives need more than the parameters as they are.
+        """
+        return self
+
 
 class AbstractSeparableHamiltonian(AbstractHamiltonian):
     """H(q, p) = T(p) + U(q). Subclass with `kinetic` and `potential`. Dissertation (5.3)."""
@@ -138,6 +145,10 @@ class Forced(eqx.Module):
     def at(self, t: Time) -> "Forced":
         """The system as it stands at time `t`."""
         return Forced(self.hamiltonian.at(t), self.forces)
+
+    def prepared(self) -> "Forced":
+        """The same system, its conservative part prepared for many steps."""
+        return Forced(self.hamiltonian.prepared(), self.forces)
 
     def reversed(self) -> "Forced":
         """The same system with its forces in the opposite order, so that a step is symmetric in time."""

@@ -91,9 +91,18 @@ def exponents(variables: int, degree: int, lowest: int = 1) -> np.ndarray:
 
 
 @functools.cache
+def _grown_exponents(variables: int, degree: int) -> np.ndarray:
+    """The powers of all products of total degree 0..`degree`, (term, variable), in the order of `_products`."""
+    if variables == 1:
+        return np.arange(degree + 1)[:, None]
+    rest = [_grown_exponents(variables - 1, degree - power) for power in range(degree + 1)]
+    return np.concatenate([np.insert(one, 0, power, axis=1) for power, one in enumerate(rest)])
+
+
+@functools.cache
 def _derivative_table(basis: AbstractBasis, variables: int, degree: int) -> np.ndarray:
     """T (variable, lower term, term): d(term)/dz_i = sum over lower terms of T[i, lower, term] times them."""
-    high, low = exponents(variables, degree), exponents(variables, degree - 1, 0)
+    high, low = exponents(variables, degree), _grown_exponents(variables, degree - 1)
     slopes = basis.slopes(degree)
     table = np.zeros((variables, len(low), len(high)))
     for i in range(variables):
@@ -102,27 +111,78 @@ def _derivative_table(basis: AbstractBasis, variables: int, degree: int) -> np.n
     return table
 
 
-def _products(basis: AbstractBasis, z: Array, powers: np.ndarray) -> Array:
-    """The basis products with these powers at z."""
-    # Multiplied one by one: the derivative of `prod` is slow, or divides by zero.
-    values = basis.values(z, int(powers.max(initial=0)))
-    features = jnp.ones(len(powers))
-    for i in range(powers.shape[1]):
-        features = features * values[powers[:, i], i]
-    return features
+def _products(basis: AbstractBasis, z: Array, degree: int) -> Array:
+    """All products of total degree 0..`degree` at z, in the order of `_grown_exponents`.
+
+    Grown from those of the later variables, by slices alone: a gather's derivative is a scatter, which is slow, and the
+    derivative of `prod` divides by zero.
+    """
+    values, made = basis.values(z, degree), {}
+    for left in range(degree + 1):
+        made[left] = values[: left + 1, -1]
+    for i in reversed(range(z.shape[0] - 1)):
+        made = {
+            left: jnp.concatenate([made[left], *(values[k, i] * made[left - k] for k in range(1, left + 1))])
+            for left in range(degree + 1)
+        }
+    return made[degree]
+
+
+@functools.cache
+def _places(variables: int, degree: int) -> np.ndarray:
+    """Where the terms of `exponents` are among those of `_grown_exponents`."""
+    same = exponents(variables, degree)[:, None] == _grown_exponents(variables, degree)[None]
+    return np.argmax(same.all(axis=2), axis=1)
 
 
 def _polynomial(basis: AbstractBasis, coefficients: Array, z: Array, degree: int) -> Array:
-    return coefficients @ _products(basis, z, exponents(z.shape[0], degree))
+    return coefficients @ _products(basis, z, degree)[_places(z.shape[0], degree)]
 
 
-def _gradient(basis: AbstractBasis, coefficients: Array, z: Array, degree: int) -> Array:
-    """The gradient as one product of a weight matrix and lower features, much cheaper than
-    differentiating."""
-    variables = z.shape[0]
-    lower = _products(basis, z, exponents(variables, degree - 1, 0))
-    weights = jnp.asarray(_derivative_table(basis, variables, degree)) @ coefficients
-    return (weights @ lower) / basis.scales(variables)
+def _weights(basis: AbstractBasis, coefficients: Array, variables: int, degree: int) -> Array:
+    """What the gradient's components (variable, lower term) are made of: the same all along a trajectory."""
+    table = jnp.asarray(_derivative_table(basis, variables, degree)) @ coefficients
+    return table / basis.scales(variables)[:, None]
+
+
+class _PreparedPotential(ig.AbstractSeparableHamiltonian):
+    """A polynomial potential with its gradient's weights worked out."""
+
+    of: "PolynomialPotential"
+    weights: Float[Array, "variable term"]
+
+    def kinetic(self, p: Float[Array, " d"]) -> Float[Array, ""]:
+        return self.of.kinetic(p)
+
+    def potential(self, q: Float[Array, " d"]) -> Float[Array, ""]:
+        return self.of.potential(q)
+
+    def velocity(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
+        return p
+
+    def slope(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
+        return self.weights @ _products(self.of.basis, q, self.of.degree - 1)
+
+
+class _Prepared(ig.AbstractHamiltonian):
+    """A polynomial with its gradient's weights worked out."""
+
+    of: "Polynomial"
+    weights: Float[Array, "variable term"]
+
+    def energy(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, ""]:
+        return self.of.energy(q, p)
+
+    def velocity(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
+        return self.vector_field(jnp.concatenate([q, p]))[: self.of.dim]
+
+    def slope(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
+        return -self.vector_field(jnp.concatenate([q, p]))[self.of.dim :]
+
+    def vector_field(self, x: Float[Array, " two_d"]) -> Float[Array, " two_d"]:
+        """dx/dt at the phase point x, by one gradient."""
+        slope, velocity = ig.split(self.weights @ _products(self.of.basis, x, self.of.degree - 1))
+        return jnp.concatenate([velocity, -slope])
 
 
 def _terms(basis: AbstractBasis, names: list[str], degree: int) -> tuple[str, ...]:
@@ -180,7 +240,11 @@ class PolynomialPotential(ig.AbstractSeparableHamiltonian):
         return p
 
     def slope(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
-        return _gradient(self.basis, self.coefficients, q, self.degree)
+        return self.prepared().slope(q, p)
+
+    def prepared(self) -> _PreparedPotential:
+        """The same potential with the weights of its gradient, much cheaper than differentiating."""
+        return _PreparedPotential(self, _weights(self.basis, self.coefficients, self.dim, self.degree))
 
     def __str__(self) -> str:
         return _equation("H(q, p)", "p'p/2", self.coefficients, self.terms)
@@ -210,18 +274,18 @@ class Polynomial(ig.AbstractHamiltonian):
         return _polynomial(self.basis, self.coefficients, jnp.concatenate([q, p]), self.degree)
 
     def velocity(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
-        return self._gradient(q, p)[self.dim :]
+        return self.prepared().velocity(q, p)
 
     def slope(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
-        return self._gradient(q, p)[: self.dim]
+        return self.prepared().slope(q, p)
 
     def vector_field(self, x: Float[Array, " two_d"]) -> Float[Array, " two_d"]:
         """dx/dt at the phase point x, by one gradient."""
-        slope, velocity = ig.split(self._gradient(*ig.split(x)))
-        return jnp.concatenate([velocity, -slope])
+        return self.prepared().vector_field(x)
 
-    def _gradient(self, q: Array, p: Array) -> Array:
-        return _gradient(self.basis, self.coefficients, jnp.concatenate([q, p]), self.degree)
+    def prepared(self) -> _Prepared:
+        """The same polynomial with the weights of its gradient, much cheaper than differentiating."""
+        return _Prepared(self, _weights(self.basis, self.coefficients, 2 * self.dim, self.degree))
 
     def __str__(self) -> str:
         return _equation("H(q, p)", "", self.coefficients, self.terms)

@@ -34,6 +34,18 @@ def gradient(score: Callable[[Array], Array], size: int) -> Callable[[Array], Ar
     return jax.jacfwd(score) if size <= _FORWARD else jax.grad(score)
 
 
+def _value_and_gradient(score: Callable[[Array], Array], size: int) -> Callable[[Array], tuple[Array, Array]]:
+    """A score and its gradient, as `gradient` has it."""
+    if size > _FORWARD:
+        return jax.value_and_grad(score)
+
+    def both(free):
+        slope, value = jax.jacfwd(lambda x: (score(x),) * 2, has_aux=True)(free)
+        return value, slope
+
+    return both
+
+
 def guarded(score: Callable[[Array], Array], size: int) -> Callable[[Array], Array]:
     """`score` with a large finite number for every non-finite one, and with derivatives that are never
     NaN."""
@@ -45,7 +57,8 @@ def guarded(score: Callable[[Array], Array], size: int) -> Callable[[Array], Arr
 
     @safe.defjvp
     def _(primals, tangents):
-        slope = gradient(score, size)(primals[0])
-        return safe(primals[0]), jnp.where(jnp.isfinite(slope), slope, 0.0) @ tangents[0]
+        # Value and slope in one pass: XLA does not see that two passes share their scans.
+        value, slope = _value_and_gradient(score, size)(primals[0])
+        return jnp.where(jnp.isfinite(value), value, HOPELESS), jnp.where(jnp.isfinite(slope), slope, 0.0) @ tangents[0]
 
     return safe
