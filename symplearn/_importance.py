@@ -16,7 +16,7 @@ from ._blocks import Course
 from ._errors import InputError
 from ._rounds import Rounds
 from ._sampler import NEGLIGIBLE, AbstractBlockSampler, Drawn, LogDensity, generator, refuse_counts, whitened
-from ._student_mixture import StudentMixture, refined, scatter
+from ._student_mixture import StudentMixture, refined, shrunk
 from ._whitening import Whitening
 
 # The weighted draws are dealt to this many hands; R-hat compares them, as it does chains.
@@ -42,8 +42,8 @@ class AdaptiveImportance(AbstractBlockSampler):
     weights is `target` and their tail is light; or until `rounds` are used up, half of them to adapt.
 
     The result is `draws` of equal weight, resampled in four independent hands; copies of one draw lie side by side, so
-    that autocorrelation, and with it the effective sample size, knows them. Good with 11 parameters, not with 36, and
-    for densities with one mode, or a few near each other. Gives the evidence. Left out, `components` are 4 for up to
+    that autocorrelation, and with it the effective sample size, knows them. Good up to some forty parameters, and for
+    densities with one mode, or a few near each other. Gives the evidence. Left out, `components` are 4 for up to
     six parameters and 1 from thirteen on, and `dof` as many as there are parameters, at least 5.
 
     **Raises:** `InputError` where a number is too small, or no draw has a finite density.
@@ -212,7 +212,10 @@ def _adapted(
     """The next proposal: a wide component over all draws, and a mixture fitted to them."""
     size, count = z.shape[1], _components(options, z.shape[1])
     weights = softened(log_weights, least=5.0 * (size + 1))
-    common = np.linalg.cholesky(scatter(z, weights))
+    middle, common = weights @ z, np.linalg.cholesky(shrunk(z, weights))
+    if count == 1:
+        fitted = StudentMixture(np.ones(1), middle[None], common[None], latest.dof)
+        return _defended(fitted, middle, common)
     if done <= _FEWEST // 2:
         points = z[random.choice(len(z), size=count, p=weights)]
         begin = StudentMixture(
@@ -221,12 +224,16 @@ def _adapted(
     else:
         shares = latest.shares[1:] / latest.shares[1:].sum()
         begin = StudentMixture(shares, latest.means[1:], latest.roots[1:], latest.dof)
-    fitted = refined(begin, z, weights, _ITERATIONS)
+    return _defended(refined(begin, z, weights, _ITERATIONS), middle, common)
+
+
+def _defended(fitted: StudentMixture, middle: np.ndarray, common: np.ndarray) -> StudentMixture:
+    """With the wide component over all draws."""
     return StudentMixture(
         np.concatenate([[_DEFENSIVE], (1 - _DEFENSIVE) * fitted.shares]),
-        np.concatenate([(weights @ z)[None], fitted.means]),
+        np.concatenate([middle[None], fitted.means]),
         np.concatenate([_STRETCH * common[None], fitted.roots]),
-        latest.dof,
+        fitted.dof,
     )
 
 

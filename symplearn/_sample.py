@@ -17,7 +17,7 @@ from ._importance import AdaptiveImportance
 from ._parameters import flatten
 from ._posterior import Posterior, log_posterior_of, posterior_of
 from ._sampler import AbstractBlockSampler, AbstractSampler, Drawn, LogDensity
-from ._whitening import Whitening, whiten
+from ._whitening import Whitening, standard, whiten
 
 
 def sample(
@@ -54,7 +54,7 @@ def sample(
         drawn = _drawn(density, whiten(density, centre), sampler, key, checkpoint, known_by)
     else:
         straight = Straightened(density, funnel)
-        start = whiten(straight, funnel.centre)
+        start = standard(straight, len(funnel.axes))
         drawn = bent_back(_drawn(straight, start, sampler, key, checkpoint, known_by), funnel)
     return posterior_of(estimate, drawn, str(sampler))
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, PRNGKeyArray
 from ._blocks import Course
 from ._importance import AdaptiveImportance, softened, weighted_sample
 from ._sampler import LogDensity, generator
-from ._student_mixture import scatter
+from ._student_mixture import shrunk
 from ._whitening import Whitening
 
 SCOUT = AdaptiveImportance(target=500, rounds=20)
@@ -31,7 +31,7 @@ def scouted(
     random = generator(key)
     sample = weighted_sample(options, density, start, random, Course("sample: scouting"))
     weights = softened(sample.log_weights, least=5.0 * (sample.z.shape[1] + 1))
-    root = np.linalg.cholesky(scatter(sample.z, weights))
+    root = np.linalg.cholesky(shrunk(sample.z, weights))
     mean = weights @ sample.z
     whitening = Whitening(
         start.free(jnp.asarray(mean)), start.root @ jnp.asarray(root), start.repaired, start.statement

@@ -57,12 +57,33 @@ def whiten(density: Any, centre: Float[Array, " parameter"]) -> Whitening:
     **Raises:** `InputError` where the density is not finite at the centre.
     """
     height, hessian = _curvature(density, centre)
-    if not bool(jnp.isfinite(height)) or float(height) < 0.5 * IMPOSSIBLE:
-        raise InputError(f"The log density is {float(height):.3g} at the start; start where it is finite.")
+    _refuse(height)
     axes, bad = _axes(np.asarray(hessian))
     widths, open_ended = _widths(density, centre, axes, height)
     repaired = int(np.sum(bad))
     return Whitening(centre, axes * widths, repaired, _statement(repaired, int(np.sum(open_ended)), centre.size))
+
+
+def standard(density: Any, size: int) -> Whitening:
+    """The coordinates of a density that is about a standard normal one; it is only looked at where it falls.
+
+    **Raises:** `InputError` where the density is not finite at 0.
+    """
+    centre, axes = jnp.zeros(size), jnp.eye(size)
+    height = _height(density, centre)
+    _refuse(height)
+    _, open_ended = _widths(density, centre, axes, height)
+    return Whitening(centre, axes, 0, _statement(0, int(np.sum(open_ended)), size))
+
+
+def _refuse(height: Array) -> None:
+    if not bool(jnp.isfinite(height)) or float(height) < 0.5 * IMPOSSIBLE:
+        raise InputError(f"The log density is {float(height):.3g} at the start; start where it is finite.")
+
+
+@eqx.filter_jit
+def _height(density, centre):
+    return density(centre)
 
 
 @eqx.filter_jit

@@ -1,4 +1,4 @@
-"""Along the process noise a posterior is a funnel; samplers walk in coordinates in which it is straight."""
+"""Along its noises a posterior is a funnel; samplers walk in coordinates in which it is straight."""
 
 import equinox as eqx
 import jax
@@ -11,7 +11,7 @@ from symplearn._arviz import arviz
 from symplearn._dram import DRAM, blocks_of
 from symplearn._fit import fit
 from symplearn._funnel import Straightened, bent_back, funnel_of
-from symplearn._importance import AdaptiveImportance
+from symplearn._importance import AdaptiveImportance, kish
 from symplearn._model import FullState, Gaussian, LinearDynamics, StateSpaceModel
 from symplearn._noise import AdditiveGaussian, Diagonal, ScaledIdentity
 from symplearn._objectives import TimeSeries
@@ -20,6 +20,7 @@ from symplearn._posterior import log_posterior_of
 from symplearn._prior import HalfNormal, Normal, Prior
 from symplearn._sample import sample
 from symplearn._sampler import Drawn
+from symplearn._whitening import whiten
 
 COUNT, READ, SPREAD = 12, 1e-3, 2.0
 READINGS = 0.7 + 0.05 * np.random.default_rng(3).normal(size=COUNT)
@@ -81,11 +82,10 @@ def test_levels_are_the_conditional_posteriors(walk):
 
 
 def test_volume_is_the_jacobians(walk):
-    """log_volume is log |det d free / d straight|, at the levels' middle, between levels and beyond the last."""
+    """log_volume is log |det d free / d straight|, between levels, beyond the last, and where widths grow no more."""
     _, density, funnel = walk
     jacobian = jax.jit(jax.jacfwd(funnel.free))
-    for s in np.asarray(funnel.levels)[[0, 4]].tolist() + [-60.0, -4.321, 5.0]:
-        straight = jnp.array([s, 0.7])
+    for straight in jnp.array([[-9.0, 0.7], [-2.0, 8.0], [-0.4321, -1.5], [0.0, -7.0], [1.5, 0.7], [7.0, 0.1]]):
         exact = np.linalg.slogdet(np.asarray(jacobian(straight)))[1]
         # Both are sums of logarithms of order 10: round-off.
         np.testing.assert_allclose(float(funnel.log_volume(straight)), exact, atol=1e-12)
@@ -96,7 +96,7 @@ def test_volume_is_the_jacobians(walk):
 def test_draws_come_back(walk):
     """Draws in straight coordinates come back in free ones, with the log density that is there."""
     _, density, funnel = walk
-    straight = funnel.centre + 0.3 * jax.random.normal(jax.random.key(0), (2, 3, 2))
+    straight = jax.random.normal(jax.random.key(0), (2, 3, 2))
     there = jax.jit(jax.vmap(jax.vmap(Straightened(density, funnel))))(straight)
     back = bent_back(Drawn(straight, there, evaluations=0), funnel)
     for chain in range(2):
@@ -127,6 +127,63 @@ def test_posterior_is_that_of_quadrature(walk):
         (draws[..., other] ** 2, mass @ (variances + means**2)),
     ):
         assert abs(found.mean() - right) < 3 * float(arviz().mcse(np.ascontiguousarray(found)))
+
+
+CHANNELS = 4
+
+
+@pytest.fixture(scope="module")
+def walks():
+    """Four walks side by side from unknown means, both of whose noises learn, and the logarithms of both variances of
+    the posterior on a grid, with its mass: each mean is integrated by the textbook's formula."""
+    random = np.random.default_rng(5)
+    readings = random.normal(size=CHANNELS) + 0.1 * random.normal(size=(COUNT, CHANNELS))
+    model = StateSpaceModel(
+        dynamics=LinearDynamics(Frozen(np.eye(CHANNELS))),
+        observation=FullState(),
+        process_noise=AdditiveGaussian(ScaledIdentity(Positive(1e-3), CHANNELS)),
+        measurement_noise=AdditiveGaussian(ScaledIdentity(Positive(1e-2), CHANNELS)),
+        initial=Gaussian(Learnt(jnp.zeros(CHANNELS)), Frozen(1e-6 * np.eye(CHANNELS))),
+    )
+    prior = Prior(PRIOR.densities | {"measurement_noise": HalfNormal(1.0)})
+    estimate = fit(model, TimeSeries(np.arange(float(COUNT)), readings), prior=prior)
+    grids = np.meshgrid(np.linspace(-18.0, -2.0, 81), np.linspace(-8.0, -2.0, 61), indexing="ij")
+    log_mass = sum(np.log(2 / np.sqrt(2 * np.pi)) - 0.5 * np.exp(2 * one) + one for one in grids)
+    order = np.minimum.outer(np.arange(COUNT), np.arange(COUNT))
+    process, measurement = (np.exp(one)[..., None, None] for one in grids)
+    of_all = measurement * np.eye(COUNT) + 1e-6 + process * order + SPREAD**2
+    solved = np.linalg.solve(of_all, np.broadcast_to(readings, (*of_all.shape[:2], COUNT, CHANNELS)))
+    squares = np.sum(readings * solved, axis=(-2, -1))
+    log_mass += -0.5 * (squares + CHANNELS * np.linalg.slogdet(2 * np.pi * of_all)[1])
+    return estimate, grids, log_mass + np.log(0.2 * 0.1)
+
+
+def test_both_noises_posterior_is_that_of_quadrature(walks):
+    """With both noises to learn, their logarithms' means and spreads, and the evidence, are those of quadrature."""
+    estimate, grids, log_mass = walks
+    posterior = sample(estimate, sampler=AdaptiveImportance(batch=500, target=1500), key=jax.random.key(3))
+    assert posterior.converged, str(posterior)
+    exact = np.log(np.sum(np.exp(log_mass - log_mass.max()))) + log_mass.max()
+    assert abs(posterior.log_evidence - exact) < 3 * posterior.log_evidence_sd < 0.3
+    mass = softmax(log_mass)
+    for name, grid in zip(("process_noise", "measurement_noise"), grids, strict=True):
+        draws = np.log(np.asarray(posterior.values[f"{name}.structure.variance"]))
+        for found, right in ((draws, np.sum(mass * grid)), (draws**2, np.sum(mass * grid**2))):
+            assert abs(found.mean() - right) < 3 * float(arviz().mcse(np.ascontiguousarray(found)))
+
+
+def test_straight_coordinates_are_standard_normal(walks):
+    """Draws of a standard normal, bent back, are worth more than four fifths as many of the posterior; draws of the
+    Laplace approximation at the maximum less than a twentieth."""
+    estimate, _, _ = walks
+    density = log_posterior_of(estimate)
+    funnel = funnel_of(estimate, density)
+    z = jax.random.normal(jax.random.key(0), (2000, CHANNELS + 2))
+    straight = jax.jit(jax.vmap(Straightened(density, funnel)))(z)
+    laplace = whiten(density, flatten(estimate.model)[0])
+    plain = jax.jit(jax.vmap(density))(laplace.free(z))
+    worth, of_laplace = (kish(np.asarray(one + 0.5 * jnp.sum(z**2, axis=1))) / len(z) for one in (straight, plain))
+    assert worth > 0.8 and of_laplace < 0.05, (worth, of_laplace)
 
 
 @pytest.mark.slow
