@@ -105,8 +105,10 @@ def learnt_from_several(
     tolerance: float,
     key: PRNGKeyArray,
 ) -> dict[str, Any]:
-    """Everything that is kept of several recordings: least squares, the MAP of each propagator, draws of the first, which
-    is as accurate as the last and a fifth of the work."""
+    """Everything that is kept of several recordings: least squares, the MAP of each propagator, draws of the first.
+
+    Which is as accurate as the last, at a fifth of the work.
+    """
     squares: Any = hamiltonian_least_squares(Polynomial(2, 3, None, LEGENDRE), recordings)
     estimates = [learn(model(*propagators[0], LEGENDRE), recordings, SideBySide(), prior=PRIOR, tolerance=tolerance)]
     for propagator in propagators[1:]:
