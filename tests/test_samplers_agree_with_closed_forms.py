@@ -64,7 +64,7 @@ def off_by(draws, exact):
 @pytest.mark.parametrize("target", TARGETS)
 @pytest.mark.parametrize("sampler", SAMPLERS, ids=NAMES)
 def test_moments_of_three_densities(sampler, target):
-    """Means, variances and the covariance of three densities are right to three Monte Carlo standard errors."""
+    """Means, variances and the covariance of three densities are right to within Monte Carlo error."""
     slope, bend, sd = TARGETS[target]
     density = Bent(*map(jnp.asarray, TARGETS[target]))
     # Started off the mode and with the wrong curvature.
@@ -72,7 +72,8 @@ def test_moments_of_three_densities(sampler, target):
     assert posterior.converged, str(posterior)
     x, y = np.moveaxis(np.asarray(posterior.values["x"]), 2, 0)
     exact = [(x, 0.0), (y, 0.0), (x**2, 1.0), (y**2, slope**2 + 2 * bend**2 + sd**2), (x * y, slope)]
-    assert max(off_by(draws, value) for draws, value in exact) < 3.0
+    # Of the 105 comparisons here one is beyond 3 standard errors by chance in a run of four, beyond 3.5 in one of twenty.
+    assert max(off_by(draws, value) for draws, value in exact) < 3.5
     if posterior.log_evidence is not None:
         assert abs(posterior.log_evidence - math.log(2 * math.pi * sd)) < 3 * posterior.log_evidence_sd
 
