@@ -32,7 +32,8 @@ from ._realisations import kept, two_at_a_time
 BATCH = 50
 # Simulations of each model, quick and full.
 SIMULATIONS = {True: 50, False: 300}
-# Repeats on each system, quick and full; fewer of the slow ones. A quick run leaves out Cherry's problem and what tells why a band is too wide.
+# Repeats on each system, quick and full; fewer of the slow ones. A quick run leaves out Cherry's problem and what tells
+# why a band is too wide.
 REPEATS = {
     "henon_heiles": (2, 100),
     "henon_heiles_order4": (0, 20),

@@ -72,7 +72,7 @@ def test_moments_of_three_densities(sampler, target):
     assert posterior.converged, str(posterior)
     x, y = np.moveaxis(np.asarray(posterior.values["x"]), 2, 0)
     exact = [(x, 0.0), (y, 0.0), (x**2, 1.0), (y**2, slope**2 + 2 * bend**2 + sd**2), (x * y, slope)]
-    # Of the 105 comparisons here one is beyond 3 standard errors by chance in a run of four, beyond 3.5 in one of twenty.
+    # One of these 105 comparisons is beyond 3 standard errors by chance in a run of four, beyond 3.5 in one of twenty.
     assert max(off_by(draws, value) for draws, value in exact) < 3.5
     if posterior.log_evidence is not None:
         assert abs(posterior.log_evidence - math.log(2 * math.pi * sd)) < 3 * posterior.log_evidence_sd
