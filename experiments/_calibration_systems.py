@@ -90,7 +90,7 @@ def _finite(paths: Any, escaped: float) -> np.ndarray:
 _CHERRY_TIMES = 0.1 * np.arange(round(cherry.TEST_UNTIL / 0.1) + 1)
 # One step of order 4 per data interval: an error of 3e-5 in 0.4 s, that of Tao's method in steps of 0.05 is 2e-5.
 _CHERRY_PROPAGATOR = (ig.suzuki4(ig.Tao(5.0)), 1)
-_CHERRY_SAMPLER = AdaptiveImportance(target=1000, rounds=40)
+_CHERRY_SAMPLER = AdaptiveImportance()
 
 
 def _cherry() -> System:

@@ -63,8 +63,8 @@ from ._realisations import kept, two_at_a_time
 DRAWS = 50
 QUICK, FULL = 5, 20
 SAMPLERS = {
-    True: AdaptiveImportance(draws=2000, target=600, batch=500, rounds=24),
-    False: AdaptiveImportance(target=1000, rounds=40),
+    True: AdaptiveImportance(draws=2000, target=1000, batch=500, rounds=24),
+    False: AdaptiveImportance(rounds=40),
 }
 # One step of order 4 per data interval: an error of 3e-5 in 0.4 s, that of Tao's method in steps of 0.05 is 2e-5.
 ORDER4 = (ig.suzuki4(ig.Tao(5.0)), 1)
