@@ -93,10 +93,12 @@ _CHERRY_PROPAGATOR = (ig.suzuki4(ig.Tao(5.0)), 1)
 _CHERRY_SAMPLER = AdaptiveImportance()
 
 
-def _cherry() -> System:
+def _cherry(disturbed: Disturbance) -> System:
+    prior = disturbed.prior(cherry.PRIOR.densities["dynamics"])
+
     def predicted(seed: int, k: int, key: PRNGKeyArray) -> tuple[Posterior, Paths]:
-        given = cherry.model(*_CHERRY_PROPAGATOR)
-        estimate = learn(given, cherry.single(seed, k), prior=cherry.PRIOR, tolerance=_TOLERANCE)
+        given = eqx.tree_at(lambda m: m.process_noise, cherry.model(*_CHERRY_PROPAGATOR), disturbed.noise(4))
+        estimate = learn(given, cherry.single(seed, k), prior=prior, tolerance=_TOLERANCE)
         posterior = sample(estimate, sampler=_CHERRY_SAMPLER, key=key)
         return posterior, {"": cherry.predictions(_coefficients(posterior), cherry.MONOMIALS, _CHERRY_TIMES)[:, 1:]}
 
@@ -106,7 +108,7 @@ def _cherry() -> System:
         lambda: cherry.truth(_CHERRY_TIMES)[1:],
         predicted,
         ("",),
-        f"{_CHERRY_PROPAGATOR}, {told(_CHERRY_SAMPLER, cherry.PRIOR)}",
+        f"{_CHERRY_PROPAGATOR}, {told(_CHERRY_SAMPLER, prior)}",
     )
 
 
@@ -236,7 +238,8 @@ SYSTEMS: dict[str, Callable[[], System]] = {
     "henon_heiles": lambda: _henon_heiles("symplectic", PUBLISHED),
     "henon_heiles_order4": lambda: _henon_heiles("order4_step_5_times_larger", PUBLISHED),
     "henon_heiles_order4_log": lambda: _henon_heiles("order4_step_5_times_larger", LOGARITHM),
-    "cherry": _cherry,
+    "cherry": lambda: _cherry(PUBLISHED),
+    "cherry_log": lambda: _cherry(LOGARITHM),
     "pendulum_flat": lambda: _pendulum(Flat(), PUBLISHED),
     "pendulum_laplace_0.1": lambda: _pendulum(Laplace(0.1), PUBLISHED),
     "pendulum_flat_log": lambda: _pendulum(Flat(), LOGARITHM),
