@@ -102,11 +102,9 @@ class Walk:
         middle = min(float(np.sum(growth)), _FARTHEST)
         mode = place[1:]
         level = Level(float(place[0]), mode, root, mode + root[:, 0] * middle, root * np.exp(growth * middle), growth)
-        for _ in range(_ROUNDS):
-            level = self._weighed(level)
-        return level
+        return self._weighed(level, _ROUNDS)
 
-    def _weighed(self, level: Level) -> Level:
+    def _weighed(self, level: Level, rounds: int) -> Level | None:
         """The level with its mass by importance sampling, and mean and root moved towards those of the draws."""
         z = _WIDER * _normal(level.mode.size)
         grown = level.growth * np.clip(z[:, :1], -FAR, FAR)
@@ -116,13 +114,14 @@ class Walk:
         # The normal density's constant is that of every level, and left out.
         log_weights = found + log_volume + 0.5 * np.sum((z / _WIDER) ** 2, axis=1)
         if not np.any(np.isfinite(log_weights)):
-            return level._replace(mass=-np.inf)
+            return None
         weights = softened(log_weights, least=_LEAST * (level.mode.size + 1))
-        return level._replace(
+        level = level._replace(
             mean=level.mean + level.root @ (weights @ z),
             root=level.root @ np.linalg.cholesky(shrunk(z, weights)),
             mass=float(logsumexp(log_weights)),
         )
+        return level if rounds == 1 else self._weighed(level, rounds - 1)
 
     def _growth(self, place: np.ndarray, root: np.ndarray) -> np.ndarray:
         """How the logarithms of the widths grow over one width of log Gamma."""
