@@ -31,6 +31,8 @@ _AT_REST = 0.05
 _LENGTHS = 8
 # Draws by which a level is weighed, in how many rounds, how much wider than it, and the least effective number of them.
 _DRAWS, _ROUNDS, _WIDER, _LEAST = 512, 3, 1.1, 5.0
+# Places that are looked at together.
+_CHUNK = 64
 
 
 class Level(NamedTuple):
@@ -145,9 +147,10 @@ class Walk:
         return float(0.5 * np.linalg.slogdet(np.asarray(noise.covariance()))[1] / len(noise.covariance()))
 
     def _values(self, places: np.ndarray) -> np.ndarray:
-        """The log posterior at some places, -inf where it is not a number; always as many are asked for."""
-        asked = np.resize(places, (_DRAWS, places.shape[1]))
-        found = np.asarray(_values(self.density, self.axes, jnp.asarray(asked)))[: len(places)]
+        """The log posterior at some places, -inf where it is not a number; in chunks of one size, compiled once."""
+        size = -(-len(places) // _CHUNK) * _CHUNK
+        chunks = np.resize(places, (size, places.shape[1])).reshape(-1, _CHUNK, places.shape[1])
+        found = np.concatenate([_values(self.density, self.axes, jnp.asarray(one)) for one in chunks])[: len(places)]
         return np.where(np.isfinite(found), found, -np.inf)
 
     def _differences(self, place: np.ndarray, root: np.ndarray | None) -> tuple[float, np.ndarray, np.ndarray]:
