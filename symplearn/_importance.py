@@ -31,6 +31,8 @@ _ITERATIONS = 5
 _LEARNT = 0.25
 # Below this Pareto k the weights have a variance.
 _VARIANCE = 0.5
+# Draws go on while one has a larger share than this, a copy in four hundred: copies count as one effective draw.
+_LARGEST_SHARE = 2.5e-3
 
 
 class AdaptiveImportance(AbstractBlockSampler):
@@ -263,7 +265,8 @@ def largest_share(log_weights: np.ndarray) -> float:
 
 
 def _light(log_weights: np.ndarray) -> bool:
-    return largest_share(log_weights) < NEGLIGIBLE or pareto_k(log_weights) < _VARIANCE
+    largest = largest_share(log_weights)
+    return largest < NEGLIGIBLE or (largest < _LARGEST_SHARE and pareto_k(log_weights) < _VARIANCE)
 
 
 def _evidence(log_weights: np.ndarray) -> tuple[float, float]:
