@@ -158,6 +158,7 @@ def walks():
     return estimate, grids, log_mass + np.log(0.2 * 0.1)
 
 
+@pytest.mark.slow
 def test_both_noises_posterior_is_that_of_quadrature(walks):
     """With both noises to learn, their logarithms' means and spreads, and the evidence, are those of quadrature."""
     estimate, grids, log_mass = walks
