@@ -173,6 +173,7 @@ def test_both_noises_posterior_is_that_of_quadrature(walks):
             assert abs(found.mean() - right) < 3 * float(arviz().mcse(np.ascontiguousarray(found)))
 
 
+@pytest.mark.slow
 def test_straight_coordinates_are_standard_normal(walks):
     """Draws of a standard normal, bent back, are worth more than four fifths as many of the posterior; draws of the
     Laplace approximation at the maximum less than a twentieth."""

@@ -186,6 +186,7 @@ def test_a_tail_open_to_zero():
     assert abs(posterior.log_evidence - 0.5 * math.log(math.pi / 2)) < 3 * posterior.log_evidence_sd
 
 
+@pytest.mark.slow
 def test_what_is_in_no_block_is_held(conjugate):
     """Blocks name their leaves' places in the free vector, and what is in none of them never moves."""
     estimate, _ = conjugate
