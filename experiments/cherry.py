@@ -108,7 +108,7 @@ def learnt_from_several(
 ) -> dict[str, Any]:
     """Everything that is kept of several recordings: least squares, the MAP of each propagator, draws of the first.
 
-    Which is as accurate as the last, at a fifth of the work.
+    Its MAP's horizon is no different from the last's, and it asks for an eighth as many gradients of H.
     """
     squares: Any = hamiltonian_least_squares(Polynomial(2, 3, None, LEGENDRE), recordings)
     estimates = [learn(model(*propagators[0], LEGENDRE), recordings, SideBySide(), prior=PRIOR, tolerance=tolerance)]

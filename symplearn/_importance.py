@@ -44,9 +44,9 @@ class AdaptiveImportance(AbstractBlockSampler):
     weights is `target` and their tail is light; or until `rounds` are used up, half of them to adapt.
 
     The result is `draws` of equal weight, resampled in four independent hands; copies of one draw lie side by side, so
-    that autocorrelation, and with it the effective sample size, knows them. Good up to some forty parameters, and for
-    densities with one mode, or a few near each other. Gives the evidence. Left out, `components` are 4 for up to
-    six parameters and 1 from thirteen on, and `dof` as many as there are parameters, at least 5.
+    that autocorrelation, and with it the effective sample size, knows them. Good with 36 parameters, in straight
+    coordinates, and for densities with one mode, or a few near each other. Gives the evidence. Left out, `components`
+    are 4 for up to six parameters and 1 from thirteen on, and `dof` as many as there are parameters, at least 5.
 
     **Raises:** `InputError` where a number is too small, or no draw has a finite density.
     """
