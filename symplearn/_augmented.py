@@ -1,27 +1,30 @@
-"""The simulation with every word of the vocabulary built in, each behind a coefficient that may be zero."""
+"""The simulation with every word of the vocabulary built in, each behind amplitudes that may be zero."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
+from functools import cached_property
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
+import numpy as np
 import sympy
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 
-import integrators as ig
-
-from ._effects import COULOMB, QUADRATIC, VISCOUS, Candidate, PowerForce, vocabulary
+from ._effects import CENTRAL, SPRING, Candidate, Effect, PowerForce, vocabulary
 from ._separable import is_separable
 from ._symbolic import derivative, jax_function
+from ._terms import Mechanics
+
+# Keeps a central force finite where both coordinates are zero; its amplitude is then zero as well.
+_TINY = sympy.Float(1e-100)
 
 
 @dataclass(frozen=True, eq=False)
 class Equations:
     """The compiled right-hand sides of an augmented simulation, all functions of one argument vector.
 
-    The vector is `[q, p, parameters, inputs, t, coefficients]`; `candidates` name the coefficients in order.
+    The vector is `[q, p, parameters, inputs, t, coefficients]`; the file's parameters come first, then those that its
+    terms bring along. `candidates` tell where theirs stand among the coefficients. With `hidden`, phase points hold one
+    unseen coordinate more than there are coordinates here.
     """
 
     coordinates: tuple[str, ...]
@@ -31,189 +34,115 @@ class Equations:
     columns: tuple[str, ...]
     candidates: tuple[Candidate, ...]
     separable: bool
+    hidden: bool
+    delayed: bool
+    start: float  # time of the first row used, from which drifts count
+    origin: float  # time that phases inside count from
+    declared: int  # coordinates of the file; the others are known hidden oscillators
+    jumping: tuple[int, ...]  # coordinates with known impulses
     energy: Callable[[Array], Array]
     slope: Callable[[Array], Array]  # dH/dq minus the known forces that no velocity enters
     velocity: Callable[[Array], Array]
     softness: Callable[[Array], Array]  # d2H/dp_i2, by which a momentum turns into a velocity
     kick: Callable[[Array], Array] | None  # known forces that a velocity or momentum enters
-    readings: Callable[[Array], Array]
-    drags: tuple[tuple[int, ...], ...]  # places of viscous, quadratic, Coulomb coefficients, by coordinate
+    readings: Callable[[Array], Array]  # what the columns show without errors of their sensors
+    impulses: Callable[[Array], Array]  # size and time of every known impulse, end to end
 
     @property
     def dim(self) -> int:
-        """Degrees of freedom."""
+        """Degrees of freedom that the simulation knows."""
         return len(self.coordinates)
+
+    @property
+    def width(self) -> int:
+        """Degrees of freedom of a phase point."""
+        return self.dim + self.hidden
+
+    @property
+    def momentum(self) -> slice:
+        """Where the momenta that the simulation knows stand in a phase point."""
+        return slice(self.width, self.width + self.dim)
+
+    @cached_property
+    def size(self) -> int:
+        """Length of the coefficient vector."""
+        last = self.candidates[-1]
+        return last.first + last.effect.size + last.effect.switched
+
+    def firsts(self, effect: Effect, side: str | None = None) -> np.ndarray:
+        """Where the values of an effect start in the coefficient vector, by target."""
+        return np.array([c.first for c in self.candidates if c.effect is effect and c.side == side], int)
+
+    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """First and second coordinate of every pair."""
+        places = np.array([c.places for c in self.candidates if c.effect is SPRING], int).reshape(-1, 2)
+        return places[:, 0], places[:, 1]
 
 
 def equations(
-    coordinates: Sequence[sympy.Symbol],
-    momenta: Sequence[sympy.Symbol],
-    hamiltonian: sympy.Expr,
+    known: Mechanics,
     parameters: Sequence[sympy.Symbol],
     inputs: Sequence[sympy.Symbol],
-    forces: Sequence[sympy.Expr],
-    readings: dict[str, sympy.Expr],
-    drifts: Mapping[str, sympy.Expr] = MappingProxyType({}),
+    hidden: bool = True,
+    delayed: bool = True,
+    origin: float | None = None,
+    unnamed: Mapping[int, tuple[sympy.Expr, ...]] | None = None,
 ) -> Equations:
     """Build the augmented simulation from parsed expressions.
 
-    `forces` has one entry per momentum. `drifts` are known errors of the columns that no gain multiplies.
+    **Arguments:** - `hidden`, `delayed`: whether an unseen oscillator and delays of sensors are built in. - `origin`:
+    time that phases inside count from; the first row's by default. - `unnamed`: terms of a force without a name, by
+    coordinate.
     """
-    names = [str(q) for q in coordinates]
-    candidates = vocabulary(names, list(readings))
-    c = [sympy.Symbol(f"c{index}*", real=True) for index in range(len(candidates))]
-    energy = hamiltonian + sum(
-        ck * one.effect.potential(coordinates[one.place])
-        for ck, one in zip(c, candidates, strict=True)
-        if isinstance(one.effect, PowerForce)
-    )
-    drags = tuple(tuple(i for i, one in enumerate(candidates) if one.effect is kind)
-                  for kind in (VISCOUS, QUADRATIC, COULOMB))  # fmt: skip
-    shaped = [_read(h, j, candidates, c) + drifts.get(column, 0) for j, (column, h) in enumerate(readings.items())]
+    coordinates, momenta, names = known.coordinates, known.momenta, [str(q) for q in known.coordinates]
+    varying = {str(p): k for k, p in enumerate(parameters)}
+    candidates = vocabulary(names[: known.declared], list(known.readings), varying, unnamed)
+    size = sum(one.effect.size + one.effect.switched for one in candidates)
+    c = [sympy.Symbol(f"c{index}*", real=True) for index in range(size)]
+    stored = [one for one in candidates if isinstance(one.effect, PowerForce) or one.effect in (SPRING, CENTRAL)]
+    energy = known.hamiltonian + sum(c[one.first] * _potential(one, coordinates) for one in stored)
+    forces = list(known.forces)
+    for one in candidates:
+        if one.terms:
+            forces[one.place] += sympy.Add(*(c[one.first + k] * term for k, term in enumerate(one.terms)))
     moving = [bool(f.free_symbols & set(momenta)) for f in forces]
     still = [sympy.Integer(0) if m else f for f, m in zip(forces, moving, strict=True)]
     driven = [f if m else sympy.Integer(0) for f, m in zip(forces, moving, strict=True)]
-    arguments = [*coordinates, *momenta, *parameters, *inputs, sympy.Symbol("t", real=True), *c]
+    every = [*parameters, *(one.symbol for one in known.further)]
+    arguments = [*coordinates, *momenta, *every, *inputs, sympy.Symbol("t", real=True), *c]
 
     def compiled(expressions: Sequence[sympy.Expr]) -> Callable[[Array], Array]:
-        return jax_function(expressions, arguments)
+        return jax.jit(jax_function(expressions, arguments))  # so that a tree is walked once, wherever it is called
 
     return Equations(
         coordinates=tuple(names),
         momenta=tuple(str(p) for p in momenta),
-        parameters=tuple(str(p) for p in parameters),
+        parameters=tuple(str(p) for p in every),
         inputs=tuple(str(u) for u in inputs),
-        columns=tuple(readings),
+        columns=tuple(known.readings),
         candidates=candidates,
-        separable=is_separable(hamiltonian, coordinates, momenta),
+        separable=is_separable(known.hamiltonian, coordinates, momenta),
+        hidden=hidden,
+        delayed=delayed,
+        start=known.start,
+        origin=known.start if origin is None else origin,
+        declared=known.declared,
+        jumping=tuple(place for place, _, _ in known.impulses),
         energy=compiled([energy]),
         slope=compiled([derivative(energy, q) - f for q, f in zip(coordinates, still, strict=True)]),
-        velocity=compiled([derivative(hamiltonian, p) for p in momenta]),
-        softness=compiled([derivative(derivative(hamiltonian, p), p) for p in momenta]),
+        velocity=compiled([derivative(known.hamiltonian, p) for p in momenta]),
+        softness=compiled([derivative(derivative(known.hamiltonian, p), p) for p in momenta]),
         kick=compiled(driven) if any(moving) else None,
-        readings=compiled(shaped),
-        drags=drags,
+        readings=compiled(list(known.readings.values())),
+        impulses=compiled([value for _, size, when in known.impulses for value in (size, when)]),
     )
 
 
-def _read(h: sympy.Expr, column: int, candidates: Sequence[Candidate], c: Sequence[sympy.Symbol]) -> sympy.Expr:
-    """The reading (1 + g) h + b of one column."""
-    mine = {one.effect.name: ck for ck, one in zip(c, candidates, strict=True)
-            if one.effect.family == "sensor" and one.place == column}  # fmt: skip
-    return (1 + mine["sensor_gain"]) * h + mine["sensor_bias"]
-
-
-class SimulatedHamiltonian(ig.AbstractHamiltonian):
-    """The Hamiltonian of a simulation file with its conservative effects, for any H(q, p)."""
-
-    equations: Equations = eqx.field(static=True)
-    parameters: Float[Array, " parameter"]
-    inputs: Float[Array, " input"]
-    time: Float[Array, ""]
-    coefficients: Float[Array, " candidate"]
-
-    def arguments(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " argument"]:
-        """The vector that the compiled equations take."""
-        return jnp.concatenate([q, p, self.parameters, self.inputs, self.time[None], self.coefficients])
-
-    def energy(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, ""]:
-        return self.equations.energy(self.arguments(q, p))[0]
-
-    def velocity(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
-        return self.equations.velocity(self.arguments(q, p))
-
-    def slope(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
-        return self.equations.slope(self.arguments(q, p))
-
-    def at(self, t: Float[Array, ""] | float) -> "SimulatedHamiltonian":
-        return SimulatedHamiltonian(self.equations, self.parameters, self.inputs, jnp.asarray(t), self.coefficients)
-
-    def kick(
-        self, q: Float[Array, " d"], p: Float[Array, " d"], dt: Float[Array, ""], ahead: float = 1.0
-    ) -> tuple[Float[Array, " d"], Bool[Array, " d"]]:
-        """The momentum after the forces that depend on velocity have acted for `dt` at frozen q, and what stuck.
-
-        Smooth drag by the explicit midpoint rule. Dry friction by the mean sign of the velocity over the time that
-        the kick stands for, which lies `ahead` (1) or behind (-1): a sign taken at one instant would make the
-        trajectory jump with the starting values. Where friction can hold every other force, it stops the motion.
-        Exact for a kinetic energy quadratic in each momentum.
-        """
-        half = p + 0.5 * dt * self._smooth(q, p)
-        p = p + dt * self._smooth(q, half)
-        friction = self.coefficients[jnp.asarray(self.equations.drags[2])]
-        v, acceleration = jax.jvp(self.velocity, (q, p), (self.velocity(q, p), -self.slope(q, p)))
-        softness = self.equations.softness(self.arguments(q, p))
-        stop = v / softness
-        held = (friction > 0) & (jnp.abs(stop) <= friction * dt) & (jnp.abs(acceleration) <= friction * softness)
-        return p - jnp.where(held, stop, friction * dt * _mean_sign(v, v + ahead * dt * acceleration)), held
-
-    def _smooth(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
-        arguments = self.arguments(q, p)
-        v = self.equations.velocity(arguments)
-        viscous, quadratic = (self.coefficients[jnp.asarray(place)] for place in self.equations.drags[:2])
-        force = -(viscous + quadratic * jnp.abs(v)) * v
-        return force if self.equations.kick is None else force + self.equations.kick(arguments)
-
-
-def _mean_sign(begin: Float[Array, " d"], end: Float[Array, " d"]) -> Float[Array, " d"]:
-    """Mean of the sign of what goes evenly from `begin` to `end`: (|end| - |begin|) / (end - begin)."""
-    crosses = begin * end < 0
-    change = jnp.where(crosses, end - begin, 1.0)
-    return jnp.where(crosses, (jnp.abs(end) - jnp.abs(begin)) / change, jnp.sign(begin + end))
-
-
-class Span(eqx.Module):
-    """One interval between rows: where it starts, its substep, and the inputs' mean over each substep."""
-
-    start: Float[Array, "..."]
-    step: Float[Array, "..."]
-    inputs: Float[Array, "... substep input"]
-
-
-class SimulatedFlow(eqx.Module):
-    """The flow of the augmented simulation over one `Span`: Hamiltonian part symplectic, dissipation by splitting.
-
-    Strang splitting with kicks of positive length outside (order 2 in the small dissipative forces), the
-    integrator's own order in everything conservative. The doubled state of Tao's method is projected by the mean of
-    its copies at every substep.
-    """
-
-    equations: Equations = eqx.field(static=True)
-    integrator: ig.AbstractIntegrator
-    parameters: Float[Array, " parameter"]
-    coefficients: Float[Array, " candidate"]
-
-    def __call__(self, x: Float[Array, " state"], span: Span) -> Float[Array, " state"]:
-        def substep(carry: tuple[Array, Array], inputs: Array) -> tuple[tuple[Array, Array], None]:
-            x, t = carry
-            return (self._substep(x, t, span.step, inputs), t + span.step), None
-
-        return jax.lax.scan(substep, (x, span.start), span.inputs)[0][0]
-
-    def hamiltonian(self, t: Float[Array, ""], inputs: Float[Array, " input"]) -> SimulatedHamiltonian:
-        """The conservative part as it stands at time `t`."""
-        return SimulatedHamiltonian(self.equations, self.parameters, inputs, t, self.coefficients)
-
-    def _substep(self, x: Array, t: Array, dt: Array, inputs: Array) -> Array:
-        system = self.hamiltonian(t + 0.5 * dt, inputs)
-        q, p = ig.split(x)
-        p, held = system.at(t + 0.25 * dt).kick(q, p, 0.5 * dt)
-        state = self.integrator.lift(jnp.concatenate([q, p]))
-        moved, p = ig.split(self.integrator.project(self.integrator.flow(system, state, t, dt)))
-        p, stuck = system.at(t + 0.75 * dt).kick(moved, p, 0.5 * dt, ahead=-1.0)
-        # Held at both ends: without this a body at rest would creep through the flow in between.
-        return jnp.concatenate([jnp.where(held & stuck, q, moved), p])
-
-
-class SimulatedReading(eqx.Module):
-    """What the sensors show at a phase point; the context is `(t, inputs)` of the row."""
-
-    equations: Equations = eqx.field(static=True)
-    parameters: Float[Array, " parameter"]
-    coefficients: Float[Array, " candidate"]
-
-    def __call__(
-        self, x: Float[Array, " state"], context: tuple[Float[Array, ""], Float[Array, " input"]]
-    ) -> Float[Array, " channel"]:
-        t, inputs = context
-        return self.equations.readings(jnp.concatenate([x, self.parameters, inputs, t[None], self.coefficients]))
+def _potential(one: Candidate, coordinates: Sequence[sympy.Symbol]) -> sympy.Expr:
+    """Potential energy of an effect per unit amplitude."""
+    q = [coordinates[place] for place in one.places]
+    if isinstance(one.effect, PowerForce):
+        return one.effect.potential(q[0])
+    if one.effect is SPRING:
+        return (q[0] - q[1]) ** 2 / 2
+    return -((q[0] ** 2 + q[1] ** 2 + _TINY) ** sympy.Rational(-3, 2))

@@ -1,45 +1,85 @@
-"""The vocabulary of left-out physics: what each effect adds, its coefficient, its family.
+"""The vocabulary of left-out physics as it is searched: what each effect's values are inside a fit.
 
-Every effect here is linear in its one coefficient, so a zero coefficient is the simulation itself and one
-compiled model serves every combination (contract, section 3).
+Inside, every effect is given by values of which the first ones are amplitudes: at zero they are the simulation itself,
+to which the effect adds in proportion. The others place it (a frequency, a time, a threshold). The coefficients of
+the contract (section 3) are functions of them.
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
+import numpy as np
 import sympy
+from jaxtyping import Float
+
+from ._vocabulary import COLUMN as COLUMN
+from ._vocabulary import COORDINATE as COORDINATE
+from ._vocabulary import PAIR as PAIR
+from ._vocabulary import PARAMETER as PARAMETER
+from ._vocabulary import VOCABULARY
+
+Values = Float[np.ndarray, "... value"]
 
 
 @dataclass(frozen=True)
-class AbstractEffect(ABC):
-    """One word of the vocabulary. `positive` says that only a positive coefficient is physical."""
+class Effect:
+    """One word of the vocabulary.
+
+    **Arguments:** - `amplitudes`: how many of its values are amplitudes. - `places`: names of the values that follow.
+    - `positive`: whether only a positive first amplitude is physical. - `switched`: whether a further entry of the
+    coefficient vector is 1 where the effect is present, which its amplitudes cannot tell.
+    """
 
     name: str
-    family: str
-    coefficient: str
+    amplitudes: int = 1
+    places: tuple[str, ...] = ()
     positive: bool = False
+    switched: bool = False
 
     @property
-    @abstractmethod
+    def family(self) -> str:
+        return VOCABULARY[self.name].family
+
+    @property
     def acts_on(self) -> str:
-        """`coordinate` for an effect of the dynamics, `column` for an effect of the sensor."""
+        """Coordinate, pair of coordinates, parameter or observed column."""
+        return VOCABULARY[self.name].target
+
+    @property
+    def coefficients(self) -> tuple[str, ...]:
+        """Names of the contract's coefficients."""
+        return VOCABULARY[self.name].coefficients
+
+    @property
+    def size(self) -> int:
+        """How many values it has inside a fit."""
+        return self.amplitudes + len(self.places)
+
+    @property
+    def is_additive(self) -> bool:
+        """Whether a known effect and a found one simply add up, in one value."""
+        return self.size == 1
+
+    @property
+    def is_dynamics(self) -> bool:
+        return self.acts_on != COLUMN
+
+    def named(self, values: Values, origin: float) -> dict[str, Any]:
+        """The contract's coefficients; `origin` is the time that phases inside are counted from."""
+        return {name: values[..., k] for k, name in enumerate(self.coefficients)}
+
+    def inner(self, named: Mapping[str, float], origin: float) -> np.ndarray:
+        """The values inside, from the contract's coefficients."""
+        return np.array([named[name] for name in self.coefficients], float)
 
 
 @dataclass(frozen=True)
-class PowerForce(AbstractEffect):
+class PowerForce(Effect):
     """A conservative force that is a power of the coordinate: F = sign * c q^power."""
 
     power: int = 0
     sign: int = -1
-
-    @property
-    def acts_on(self) -> str:
-        return "coordinate"
-
-    def force(self, q: sympy.Expr) -> sympy.Expr:
-        """Force per unit coefficient."""
-        return sympy.Integer(self.sign) * q**self.power
 
     def potential(self, q: sympy.Expr) -> sympy.Expr:
         """Potential energy per unit coefficient, so that the force is minus its slope."""
@@ -47,63 +87,160 @@ class PowerForce(AbstractEffect):
 
 
 @dataclass(frozen=True)
-class Drag(AbstractEffect):
+class Drag(Effect):
     """A force against the velocity: F = -c |v|^(power - 1) v; power 0 is dry (Coulomb) friction."""
 
     power: int = 1
 
-    @property
-    def acts_on(self) -> str:
-        return "coordinate"
+
+@dataclass(frozen=True)
+class Oscillating(Effect):
+    """a cos(omega t + phi), inside A cos(omega (t - origin)) + B sin(omega (t - origin)), omega."""
+
+    def named(self, values: Values, origin: float) -> dict[str, Any]:
+        cosine, sine, omega = np.moveaxis(np.asarray(values), -1, 0)
+        # A negative frequency is the same cosine with the phase reversed.
+        phase = np.sign(omega) * (np.arctan2(-sine, cosine) - omega * origin)
+        wrapped = np.pi - np.mod(np.pi - phase, 2 * np.pi)
+        return {"a": np.hypot(cosine, sine), "omega": np.abs(omega), "phi": wrapped}
+
+    def inner(self, named: Mapping[str, float], origin: float) -> np.ndarray:
+        phase = named["phi"] + named["omega"] * origin
+        return np.array([named["a"] * np.cos(phase), -named["a"] * np.sin(phase), named["omega"]])
 
 
 @dataclass(frozen=True)
-class SensorError(AbstractEffect):
-    """An error of the reading: `bias` adds b, `gain` multiplies by 1 + g."""
+class SelfExcitation(Effect):
+    """F = c (1 - q^2/a^2) v, inside c v - e q^2 v."""
 
-    @property
-    def acts_on(self) -> str:
-        return "column"
+    def named(self, values: Values, origin: float) -> dict[str, Any]:
+        c, e = np.moveaxis(np.asarray(values), -1, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return {"c": c, "a": np.sqrt(np.maximum(c / e, 0.0))}
+
+    def inner(self, named: Mapping[str, float], origin: float) -> np.ndarray:
+        return np.array([named["c"], named["c"] / named["a"] ** 2])
 
 
-VISCOUS = Drag("viscous_damping", "dissipation", "c", positive=True, power=1)
-QUADRATIC = Drag("quadratic_drag", "dissipation", "c", positive=True, power=2)
-COULOMB = Drag("coulomb_friction", "dissipation", "f", positive=True, power=0)
-DRAGS = (VISCOUS, QUADRATIC, COULOMB)
+@dataclass(frozen=True)
+class HiddenOscillator(Effect):
+    """An unseen coordinate, inside scaled to the force w that it exerts: w'' = -omega^2 w + kappa^2 q.
+
+    At strength zero nothing hangs on the square root of anything, so the score there is regular.
+    """
+
+    def named(self, values: Values, origin: float) -> dict[str, Any]:
+        strength, omega = np.moveaxis(np.asarray(values), -1, 0)
+        return {"omega": np.abs(omega), "kappa": np.sqrt(np.maximum(strength, 0.0))}
+
+    def inner(self, named: Mapping[str, float], origin: float) -> np.ndarray:
+        return np.array([named["kappa"] ** 2, named["omega"]])
+
+
+VISCOUS = Drag("viscous_damping", positive=True, power=1)
+QUADRATIC = Drag("quadratic_drag", positive=True, power=2)
+COULOMB = Drag("coulomb_friction", positive=True, power=0)
 POWERS = (
-    PowerForce("constant_force", "conservative", "f", power=0, sign=1),
-    PowerForce("linear_stiffness", "conservative", "k", power=1),
-    PowerForce("quadratic_stiffness", "conservative", "k", power=2),
-    PowerForce("cubic_stiffness", "conservative", "k", power=3),
+    PowerForce("constant_force", power=0, sign=1),
+    PowerForce("linear_stiffness", power=1),
+    PowerForce("quadratic_stiffness", power=2),
+    PowerForce("cubic_stiffness", power=3),
 )
-BIAS = SensorError("sensor_bias", "sensor", "b")
-GAIN = SensorError("sensor_gain", "sensor", "g")
-SENSORS = (BIAS, GAIN)
-EFFECTS: dict[str, AbstractEffect] = {e.name: e for e in (*DRAGS, *POWERS, *SENSORS)}
+EXCITATION = SelfExcitation("self_excitation", amplitudes=2)
+STOP = Effect("contact_stop", places=("a",), positive=True)
+FORCING = Oscillating("periodic_forcing", amplitudes=2, places=("omega",))
+IMPULSE = Effect("impulse", places=("t_star",))
+HIDDEN = HiddenOscillator("hidden_oscillator", places=("omega",), positive=True, switched=True)
+RELATIVE = Effect("relative_damping", positive=True)
+SPRING = Effect("coupling_spring")
+CENTRAL = Effect("central_correction")
+GYROSCOPIC = Effect("gyroscopic_coupling")
+ERROR = Effect("parameter_error")
+DRIFTING = Effect("parameter_drift")
+REGIME = Effect("regime_change", places=("t_star",))
+MODULATION = Oscillating("parametric_modulation", amplitudes=2, places=("omega",))
+BIAS = Effect("sensor_bias")
+GAIN = Effect("sensor_gain")
+DRIFT = Effect("sensor_drift")
+DELAY = Effect("sensor_delay", positive=True)
+# These two change how readings scatter and not where they lie, so they have no value in the model.
+NOISE = Effect("sensor_noise", amplitudes=0)
+OUTLIERS = Effect("sensor_outliers", amplitudes=0)
+
+UNNAMED = Effect("unnamed_force")  # its amplitudes are as many as its expression has terms
+
+ON_COORDINATES = (*POWERS, VISCOUS, QUADRATIC, COULOMB, EXCITATION, STOP, FORCING, IMPULSE, HIDDEN)
+ON_PAIRS = (RELATIVE, SPRING, CENTRAL, GYROSCOPIC)
+ON_PARAMETERS = (ERROR, DRIFTING, REGIME, MODULATION)
+ON_COLUMNS = (NOISE, BIAS, GAIN, DRIFT, DELAY, OUTLIERS)
+EFFECTS: dict[str, Effect] = {e.name: e for e in (*ON_COORDINATES, *ON_PAIRS, *ON_PARAMETERS, *ON_COLUMNS)}
+SIDES = ("upper", "lower")
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect on a target: one entry of the coefficient vector of the augmented model."""
+    """An effect on a target. Its values start at `first` of the coefficient vector of the augmented model.
 
-    effect: AbstractEffect
-    target: str
-    place: int  # which coordinate or column the target is
+    `places` are the numbers of its coordinates, parameter or column.
+    """
+
+    effect: Effect
+    targets: tuple[str, ...]
+    places: tuple[int, ...]
+    side: str | None = None
+    first: int = field(default=0, compare=False)
+    terms: tuple[sympy.Expr, ...] = ()  # of an unnamed force
 
     @property
-    def key(self) -> tuple[str, str]:
-        """Effect name and target, as they stand in the answer."""
-        return self.effect.name, self.target
+    def target(self) -> str | list[str]:
+        """The target as it stands in the answer."""
+        return self.targets[0] if len(self.targets) == 1 else list(self.targets)
+
+    @property
+    def place(self) -> int:
+        """Number of the first coordinate, or of the parameter or column."""
+        return self.places[0]
+
+    @property
+    def key(self) -> tuple[str, tuple[str, ...]]:
+        """Effect name and targets, by which findings are told apart."""
+        return self.effect.name, self.targets
+
+    @property
+    def values(self) -> slice:
+        """Where its values stand in the coefficient vector."""
+        return slice(self.first, self.first + self.effect.size)
 
     def __str__(self) -> str:
-        return f"{self.effect.name}({self.target})"
+        return f"{self.effect.name}({', '.join(self.targets)})"
 
 
-def vocabulary(coordinates: Sequence[str], columns: Sequence[str]) -> tuple[Candidate, ...]:
-    """Every effect on every target of a system, in the order of the coefficient vector."""
-    moving = [Candidate(e, q, i) for i, q in enumerate(coordinates) for e in (*POWERS, *DRAGS)]
-    reading = [Candidate(e, c, j) for j, c in enumerate(columns) for e in SENSORS]
-    return (*moving, *reading)
+def vocabulary(
+    coordinates: Sequence[str],
+    columns: Sequence[str],
+    parameters: Mapping[str, int] | None = None,
+    unnamed: Mapping[int, tuple[sympy.Expr, ...]] | None = None,
+) -> tuple[Candidate, ...]:
+    """Every effect on every target of a system, in the order of the coefficient vector.
+
+    `parameters` are the names and numbers of those that may vary; `unnamed` the terms of a force by coordinate.
+    """
+    pairs = [(i, j) for j in range(len(coordinates)) for i in range(j)]
+    listed: list[Candidate] = []
+    for effect in ON_COORDINATES:
+        sides: tuple[str | None, ...] = SIDES if effect is STOP else (None,)
+        listed += [Candidate(effect, (q,), (i,), side) for side in sides for i, q in enumerate(coordinates)]
+    for effect in ON_PAIRS:
+        listed += [Candidate(effect, (coordinates[i], coordinates[j]), (i, j)) for i, j in pairs]
+    for effect in ON_PARAMETERS:
+        listed += [Candidate(effect, (name,), (k,)) for name, k in (parameters or {}).items()]
+    for effect in ON_COLUMNS:
+        listed += [Candidate(effect, (c,), (j,)) for j, c in enumerate(columns)]
+    for i, terms in (unnamed or {}).items():
+        effect = replace(UNNAMED, amplitudes=len(terms))
+        listed.append(Candidate(effect, (coordinates[i],), (i,), terms=terms))
+    first = np.cumsum([0, *(one.effect.size + one.effect.switched for one in listed)])
+    return tuple(replace(one, first=int(k)) for one, k in zip(listed, first, strict=False))
 
 
 def prices(candidates: Sequence[Candidate], families: Sequence[str]) -> dict[int, float]:

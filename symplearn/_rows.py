@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ._augmented import Span
+from ._augmented_flow import Span
 from ._thinning import Thinned, thin, thinning_width
 
 # A gap this much wider than the usual one is bridged by rows without readings, so that one substep fits all spans.

@@ -1,35 +1,55 @@
-"""Known terms of a simulation file that are written into its equations: everything but the nine searched effects.
+"""Known terms of a simulation file that are written into its equations: those that do not merely add.
 
-A searched effect stays a coefficient of the augmented model; the others, with known numbers, become part of the
-Hamiltonian, the forces, the parameters or the readings (contract, section 3).
+An effect of one coefficient stays an entry of the augmented model's vector, to which the search adds; the others become
+part of the Hamiltonian, the forces or the parameters (contract, section 3). A calibrated coefficient, and a mask for a
+term that is not in every recording, are further parameters.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import sympy
 
-from ._effects import EFFECTS
 from ._errors import InputError
 from ._expression import symbol
 from ._kinks import Maximum, Step
-from ._simulation_records import SimulationFile, Term
+from ._simulation_records import Quantity, SimulationFile, Term
 from ._symbolic import derivative
 
 _TIME = symbol("t")
+# Effects that change how readings scatter, and no equation.
+_SCATTER = ("sensor_noise", "sensor_outliers")
+
+
+@dataclass(frozen=True)
+class Further:
+    """A parameter that a term brings along: its value, the recordings where it is not zero, its name in sentences."""
+
+    symbol: sympy.Symbol
+    quantity: Quantity
+    recordings: tuple[int, ...] | None
+    name: str
 
 
 @dataclass
 class Mechanics:
-    """The expressions of a simulation: Hamiltonian, force on every momentum, reading and drift of every column."""
+    """The expressions of a simulation: Hamiltonian, force on every momentum, and reading of every column.
+
+    The first `declared` coordinates are the file's own; known hidden oscillators follow them.
+    """
 
     coordinates: list[sympy.Symbol]
     momenta: list[sympy.Symbol]
     hamiltonian: sympy.Expr
     forces: list[sympy.Expr]
     readings: dict[str, sympy.Expr]
-    drifts: dict[str, sympy.Expr]
     start: float  # time of the first row used
+    declared: int = 0
+    impulses: list[tuple[int, sympy.Expr, sympy.Expr]] = field(default_factory=list)
+    further: list[Further] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.declared = self.declared or len(self.coordinates)
 
     def place(self, coordinate: str) -> int:
         return self.coordinates.index(symbol(coordinate))
@@ -39,10 +59,7 @@ class Mechanics:
 
 
 def mechanics(file: SimulationFile, start: float) -> Mechanics:
-    """The expressions of a file with its known terms written in; `start` is the time of the first row used.
-
-    `InputError` for a term that cannot be simulated.
-    """
+    """The expressions of a file with its known terms written in; `start` is the time of the first row used."""
     zero = sympy.Integer(0)
     built = Mechanics(
         [symbol(q) for q in file.coordinates],
@@ -50,117 +67,117 @@ def mechanics(file: SimulationFile, start: float) -> Mechanics:
         file.hamiltonian.tree,
         [file.forces[p].tree if p in file.forces else zero for p in file.momenta],
         {column: h.tree for column, h in file.recording.observe.items()},
-        {column: zero for column in file.recording.observe},
         start,
     )
     for number, term in enumerate(file.terms, start=1):
-        if term.effect not in EFFECTS:
-            _check(file, term, number)
-            if term.effect in _WRITTEN:
-                _WRITTEN[term.effect](built, term, {n: sympy.Float(q.value) for n, q in term.coefficients.items()})
+        _check(file, term, number)
+        if term.effect in _WRITTEN:
+            _WRITTEN[term.effect](built, term, _numbers(built, term, number))
     return built
 
 
+def _numbers(built: Mechanics, term: Term, number: int) -> "_Numbers":
+    """A term's coefficients: numbers where they are known, else parameters; the first is masked by recording."""
+    out: _Numbers = {}
+    for name, quantity in term.coefficients.items():
+        out[name] = sympy.Float(quantity.value)
+        if not quantity.known:
+            out[name] = sympy.Symbol(f"term{number}.{name}", real=True)
+            spoken = f"{term.effect}({', '.join(term.target)}).{name}"
+            built.further.append(Further(out[name], quantity, None, spoken))
+    if term.recordings is not None:
+        mask = sympy.Symbol(f"term{number}.on", real=True)
+        built.further.append(Further(mask, Quantity(1.0), term.recordings, ""))
+        out["on"] = mask
+    return out
+
+
 def noise_factor(file: SimulationFile, column: str) -> float:
-    """By how much known `sensor_noise` terms widen the noise of a column."""
+    """By how much `sensor_noise` terms widen the noise of a column; NaN where one of them is calibrated."""
     factor = 1.0
     for term in file.terms:
         if term.effect == "sensor_noise" and term.target == (column,):
-            factor *= term.coefficients["s"].value
+            s = term.coefficients["s"]
+            factor *= s.value if s.known else float("nan")
     return factor
 
 
 def _check(file: SimulationFile, term: Term, number: int) -> None:
-    place = f"{file.name}: [[terms]] {number}: {term.effect}"
-    if term.effect not in _WRITTEN and term.effect != "sensor_noise":
-        raise InputError(f"{place} cannot be simulated by this version; leave it out, or write its force into [forces]")
-    if not all(q.known for q in term.coefficients.values()):
-        raise InputError(f"{place} can only have known coefficients in this version; give plain numbers")
-    if term.recordings is not None:
-        raise InputError(f"{place} can only be in all recordings in this version; leave `recordings` out")
+    if term.effect in _SCATTER and term.recordings is not None:
+        raise InputError(
+            f"{file.name}: [[terms]] {number}: {term.effect} can only be in all recordings; leave `recordings` out, "
+            "or diagnose the recordings one by one"
+        )
 
 
 _Numbers = dict[str, sympy.Expr]
+
+
+def _on(c: _Numbers) -> sympy.Expr:
+    """One, or the mask of a term that is not in every recording."""
+    return c.get("on", sympy.Integer(1))
 
 
 def _push(built: Mechanics, coordinate: str, force: sympy.Expr) -> None:
     built.forces[built.place(coordinate)] += force
 
 
-def _relative_damping(built: Mechanics, term: Term, c: _Numbers) -> None:
-    i, j = (built.place(q) for q in term.target)
-    force = -c["c"] * (built.velocity(i) - built.velocity(j))
-    _push(built, term.target[0], force)
-    _push(built, term.target[1], -force)
-
-
 def _self_excitation(built: Mechanics, term: Term, c: _Numbers) -> None:
     i = built.place(term.target[0])
-    _push(built, term.target[0], c["c"] * (1 - built.coordinates[i] ** 2 / c["a"] ** 2) * built.velocity(i))
-
-
-def _coupling_spring(built: Mechanics, term: Term, c: _Numbers) -> None:
-    q, r = (symbol(name) for name in term.target)
-    built.hamiltonian += c["k"] * (q - r) ** 2 / 2
+    push = c["c"] * (1 - built.coordinates[i] ** 2 / c["a"] ** 2) * built.velocity(i)
+    _push(built, term.target[0], _on(c) * push)
 
 
 def _contact_stop(built: Mechanics, term: Term, c: _Numbers) -> None:
     q = symbol(term.target[0])
     depth = c["a"] - q if term.side == "lower" else q - c["a"]
-    push = c["k"] * Maximum(depth, sympy.Integer(0))
+    push = _on(c) * c["k"] * Maximum(depth, sympy.Integer(0))
     _push(built, term.target[0], push if term.side == "lower" else -push)
 
 
-def _central_correction(built: Mechanics, term: Term, c: _Numbers) -> None:
-    q, r = (symbol(name) for name in term.target)
-    built.hamiltonian += -c["b"] * (q**2 + r**2) ** sympy.Rational(-3, 2)
-
-
-def _gyroscopic_coupling(built: Mechanics, term: Term, c: _Numbers) -> None:
-    i, j = (built.place(q) for q in term.target)
-    along = built.velocity(i), built.velocity(j)
-    _push(built, term.target[0], c["b"] * along[1])
-    _push(built, term.target[1], -c["b"] * along[0])
-
-
 def _periodic_forcing(built: Mechanics, term: Term, c: _Numbers) -> None:
-    _push(built, term.target[0], c["a"] * sympy.cos(c["omega"] * _TIME + c["phi"]))
+    _push(built, term.target[0], _on(c) * c["a"] * sympy.cos(c["omega"] * _TIME + c["phi"]))
+
+
+def _impulse(built: Mechanics, term: Term, c: _Numbers) -> None:
+    built.impulses.append((built.place(term.target[0]), _on(c) * c["j"], c["t_star"]))
+
+
+def _hidden_oscillator(built: Mechanics, term: Term, c: _Numbers) -> None:
+    number = len(built.coordinates) - built.declared + 1
+    z, momentum = (sympy.Symbol(f"{name}{number}*", real=True) for name in ("hidden", "hidden_momentum"))
+    built.coordinates.append(z)
+    built.momenta.append(momentum)
+    built.forces.append(sympy.Integer(0))
+    coupling = _on(c) * c["kappa"] * symbol(term.target[0]) * z
+    built.hamiltonian += momentum**2 / 2 + c["omega"] ** 2 * z**2 / 2 - coupling
 
 
 def _unnamed_force(built: Mechanics, term: Term, c: _Numbers) -> None:
     assert term.expression is not None  # the file was checked
-    _push(built, term.target[0], term.expression.tree)
+    _push(built, term.target[0], _on(c) * term.expression.tree)
 
 
-def _sensor_drift(built: Mechanics, term: Term, c: _Numbers) -> None:
-    built.drifts[term.target[0]] += c["r"] * (_TIME - built.start)
-
-
-def _scaled(factor: Callable[[Mechanics, _Numbers], sympy.Expr]) -> Callable[[Mechanics, Term, _Numbers], None]:
-    """A term that multiplies a parameter wherever it stands."""
+def _scaled(change: Callable[[Mechanics, _Numbers], sympy.Expr]) -> Callable[[Mechanics, Term, _Numbers], None]:
+    """A term that multiplies a parameter by 1 + `change` wherever it stands."""
 
     def write(built: Mechanics, term: Term, c: _Numbers) -> None:
         parameter = symbol(term.target[0])
-        change = {parameter: parameter * factor(built, c)}
-        built.hamiltonian = built.hamiltonian.xreplace(change)
-        built.forces = [force.xreplace(change) for force in built.forces]
-        built.readings = {column: h.xreplace(change) for column, h in built.readings.items()}
+        changed: Mapping[sympy.Expr, sympy.Expr] = {parameter: parameter * (1 + _on(c) * change(built, c))}
+        built.hamiltonian = built.hamiltonian.xreplace(changed)
+        built.forces = [force.xreplace(changed) for force in built.forces]
+        built.readings = {column: h.xreplace(changed) for column, h in built.readings.items()}
 
     return write
 
 
 _WRITTEN: dict[str, Callable[[Mechanics, Term, _Numbers], None]] = {
-    "relative_damping": _relative_damping,
     "self_excitation": _self_excitation,
-    "coupling_spring": _coupling_spring,
     "contact_stop": _contact_stop,
-    "central_correction": _central_correction,
-    "gyroscopic_coupling": _gyroscopic_coupling,
     "periodic_forcing": _periodic_forcing,
+    "impulse": _impulse,
+    "hidden_oscillator": _hidden_oscillator,
     "unnamed_force": _unnamed_force,
-    "sensor_drift": _sensor_drift,
-    "parametric_modulation": _scaled(lambda built, c: 1 + c["a"] * sympy.cos(c["omega"] * _TIME + c["phi"])),
-    "parameter_drift": _scaled(lambda built, c: 1 + c["r"] * (_TIME - built.start)),
-    "regime_change": _scaled(lambda built, c: 1 + c["d"] * Step(_TIME - c["t_star"])),
-    "parameter_error": _scaled(lambda built, c: 1 + c["d"]),
+    "parametric_modulation": _scaled(lambda built, c: c["a"] * sympy.cos(c["omega"] * _TIME + c["phi"])),
+    "regime_change": _scaled(lambda built, c: c["d"] * Step(_TIME - c["t_star"])),
 }

@@ -206,3 +206,7 @@ def _usage_sentence(error: Any) -> str:
     """An error of the command line's own on one line."""
     command = error.ctx.command_path if getattr(error, "ctx", None) else "symplearn"
     return f"{printable(error.format_message().rstrip('.'))}; `{command} --help` tells what can be given"
+
+
+if __name__ == "__main__":
+    main()

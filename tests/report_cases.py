@@ -202,3 +202,77 @@ def consistent():
     one = dataclasses.replace(one, before=one.after, force_before=one.force_after, boundary=float(one.times[-1]))
     equations = ("d(p)/dt = -F*sin(theta)", "angle_deg = 180*theta/pi")
     return damped_pendulum(document=answer, series=(one,), equation_after=equations)
+
+
+TWO_MASSES = """
+title = "Two masses"
+[system]
+coordinates = ["x", "y"]
+momenta = ["p_x", "p_y"]
+hamiltonian = "(p_x**2 + p_y**2)/(2*m) + x**2 + y**2"
+[parameters]
+m = 1.0
+[recording]
+time = "t_s"
+[recording.observe]
+left = "x"
+[units]
+left = "m"
+x = "m"
+y = "m"
+p_x = "N s"
+p_y = "N s"
+t = "s"
+"""
+
+
+def _estimates(**numbers):
+    """Coefficients from their means and standard deviations."""
+    return {
+        name: {"mean": m, "sd": s, "interval95": [round(m - 2 * s, 9), round(m + 2 * s, 9)]}
+        for name, (m, s) in numbers.items()
+    }
+
+
+def _found(effect, target, coefficients, recordings=(1, 2)):
+    """A finding as the document has it."""
+    return document()["findings"][0] | {
+        "effect": effect,
+        "target": target,
+        "recordings": list(recordings),
+        "coefficients": coefficients,
+        "sentence": f"{effect} was left out.",
+    }
+
+
+def two_masses():
+    """Two coordinates in two recordings: a pair, a side, several coefficients, and an effect that is in one only."""
+    answer = document()
+    answer["findings"] = [
+        _found("coupling_spring", ["x", "y"], _estimates(k=(3.1, 0.1))),
+        _found("contact_stop", "y", _estimates(k=(40.0, 2.0), a=(0.7, 0.01)) | {"side": "lower"}, (2,)),
+        _found("periodic_forcing", "x", _estimates(a=(0.2, 0.02), omega=(2.1, 0.01), phi=(0.3, 0.05))),
+        _found("unnamed_force", "x", {"expression": "-0.1*x**3"}),
+    ]
+    answer["location"] |= {
+        "targets": [["x", "y"], "y", "x"],
+        "recordings": [1, 2],
+        "time_windows": [[0.0, 3.0, 1], [1.5, 3.0, 2]],
+    }
+    rivals = [_found("parameter_drift", "m", {}), _found("sensor_bias", "left", {}, (1,))]
+    answer["alternatives"][0]["findings"] = rivals
+    return damped_pendulum(
+        document=answer,
+        columns=("left",),
+        coordinates=("x", "y"),
+        units={"left": "m", "x": "m", "y": "m", "p_x": "N s", "p_y": "N s", "t": "s"},
+        series=tuple(_doubled(series(rows=80, end=4.0, seed=k)) for k in range(2)),
+        augmented=parse_simulation(TWO_MASSES, "simulation.toml"),
+    )
+
+
+def _doubled(one):
+    """A recording with a second coordinate that lags behind the first."""
+    names = ("position", "velocity", "force_before", "force_after", "strain_before", "strain_after")
+    both = {name: np.hstack([getattr(one, name), np.roll(getattr(one, name), 7)]) for name in names}
+    return dataclasses.replace(one, **both)

@@ -9,27 +9,48 @@ import pytest
 
 from symplearn._effects import prices, vocabulary
 from symplearn.diagnosis._calibrate import Priors
+from symplearn.diagnosis._found import Found
 from symplearn.diagnosis._posterior import posterior
-from symplearn.diagnosis._search import Found
 from symplearn.diagnosis._weighed import Estimate
 
 # Sums of a few dozen numbers below one.
 ROUND_OFF = 1e-12
 
-# By hand from the contract: families conservative, dissipation, sensor and `any` (what has no name) share equally,
-# then the effects of a family, then the two coordinates or the two columns.
-FAMILIES = 4
-EFFECTS = {"conservative": 4, "dissipation": 3, "sensor": 2}
+# By hand from the contract: the families and `any` (what has no name) share equally, then the effects of a family,
+# then the two coordinates, their pair, the two columns, or the parameter, whose value is known. No noise is given, so
+# that none can be wrong.
+EFFECTS = {
+    "dissipation": ["viscous_damping", "quadratic_drag", "coulomb_friction", "relative_damping"],
+    "activity": ["self_excitation"],
+    "conservative": ["constant_force", "linear_stiffness", "quadratic_stiffness", "cubic_stiffness", "coupling_spring",
+                     "contact_stop", "central_correction"],
+    "gyroscopic": ["gyroscopic_coupling"],
+    "forcing": ["periodic_forcing", "impulse"],
+    "time variation": ["parametric_modulation", "parameter_drift", "regime_change"],
+    "hidden degree of freedom": ["hidden_oscillator"],
+    "calibration": ["parameter_error"],
+    "sensor": ["sensor_bias", "sensor_gain", "sensor_drift", "sensor_delay", "sensor_outliers"],
+}  # fmt: skip
+FAMILIES = len(EFFECTS) + 1
+DAMPING, GAIN = 1 / (FAMILIES * 4 * 2), 1 / (FAMILIES * 5 * 2)  # of a drag on a coordinate, of a gain on a column
+ONE_TARGET = {"relative_damping", "coupling_spring", "central_correction", "gyroscopic_coupling",
+              "parametric_modulation", "parameter_drift", "regime_change", "parameter_error"}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def problem():
-    file = cases.simulation("(p1**2 + p2**2 + q1**2 + q2**2)/2", ["q1", "q2"], ["p1", "p2"], {"a": "q1", "b": "q2"})
-    return cases.problem(file, [cases.recorded(np.arange(10.0), np.ones((10, 2)))], 1.0)
+    return made(1)
+
+
+def made(recordings):
+    """Two coordinates, a parameter, two columns."""
+    file = cases.simulation("(p1**2 + p2**2 + k*q1**2 + q2**2)/2", ["q1", "q2"], ["p1", "p2"], {"a": "q1", "b": "q2"},
+                            more="[parameters]\nk = 1.0")  # fmt: skip
+    return cases.problem(file, [cases.recorded(np.arange(10.0), np.ones((10, 2)))] * recordings, 1.0)
 
 
 def place(problem, effect, target):
-    return next(i for i, c in enumerate(problem.equations.candidates) if c.key == (effect, target))
+    return next(i for i, c in enumerate(problem.equations.candidates) if c.key == (effect, (target,)))
 
 
 def estimate(problem, combination, log_evidence, kind="white", sd=0.01):
@@ -40,8 +61,8 @@ def estimate(problem, combination, log_evidence, kind="white", sd=0.01):
 
 
 def found(problem, *estimates):
-    zero, ones = np.zeros(problem.size), np.ones(len(problem.equations.candidates))
-    out = Found(Priors(zero, zero, ones))
+    zero, ones = np.zeros(problem.size), np.ones(problem.equations.size)
+    out = Found(problem, Priors(zero, zero, 0 * ones, ones, -ones, ones, np.ones(2)))
     for one in estimates:
         out.add(one)
     return out
@@ -52,25 +73,72 @@ def singles(problem):
 
 
 def price(problem, candidate):
-    family = problem.equations.candidates[candidate].effect.family
-    return 1 / (FAMILIES * EFFECTS[family] * 2)
+    one = problem.equations.candidates[candidate].effect
+    targets = 1 if one.name in ONE_TARGET else (4 if one.name == "contact_stop" else 2)  # a stop has two sides
+    return 1 / (FAMILIES * len(EFFECTS[one.family]) * targets)
 
 
 def test_every_effect_on_every_target_is_in_the_vocabulary(problem):
-    """Two coordinates and two columns have 2 x 7 effects of the dynamics and 2 x 2 of the sensor, none twice."""
-    keys = [c.key for c in problem.equations.candidates]
-    assert len(set(keys)) == len(keys) == 2 * 7 + 2 * 2
-    assert {t for e, t in keys if e.startswith("sensor")} == {"a", "b"}
-    assert {t for e, t in keys if not e.startswith("sensor")} == {"q1", "q2"}
+    """Two coordinates, their pair, a parameter and two columns, each once with each effect; a stop once by side."""
+    keys = [(c.effect.name, c.target if isinstance(c.target, str) else tuple(c.target), c.side)
+            for c in problem.equations.candidates]  # fmt: skip
+    assert len(set(keys)) == len(keys)
+    by_hand = {effect for family in EFFECTS.values() for effect in family} | {"sensor_noise"}
+    assert {effect for effect, _, _ in keys} == by_hand
+    for effect in by_hand:
+        targets = {target for name, target, _ in keys if name == effect}
+        if effect in ("relative_damping", "coupling_spring", "central_correction", "gyroscopic_coupling"):
+            assert targets == {("q1", "q2")}
+        elif effect in ONE_TARGET:
+            assert targets == {"k"}
+        else:
+            assert targets == ({"a", "b"} if effect.startswith("sensor") else {"q1", "q2"})
+    assert {side for effect, _, side in keys if effect == "contact_stop"} == {"upper", "lower"}
+    assert {problem.candidate(m).effect.name for m in problem.searched} == by_hand - {"sensor_noise"}
+
+
+def test_values_of_candidates_fill_the_coefficient_vector_once(problem):
+    """Every entry of the vector belongs to one candidate."""
+    taken = np.zeros(problem.equations.size, int)
+    for c in problem.equations.candidates:
+        taken[c.first : c.first + c.effect.size + c.effect.switched] += 1
+    assert (taken == 1).all()
 
 
 def test_prices_are_shared_by_families_then_effects_then_targets(problem):
     """Each price is 1 / (families x effects of its family x targets), and with the unexplained they sum to one."""
-    candidates = problem.equations.candidates
-    found = prices(candidates, ["any", "conservative", "dissipation", "sensor"])
-    for index in range(len(candidates)):
-        assert found[index] == pytest.approx(price(problem, index), rel=ROUND_OFF)
+    candidates = [problem.candidate(m) for m in problem.searched]
+    found = prices(candidates, ["any", *EFFECTS])
+    for index, member in enumerate(problem.searched):
+        assert found[index] == pytest.approx(price(problem, member), rel=ROUND_OFF)
     assert sum(found.values()) + 1 / FAMILIES == pytest.approx(1.0, rel=ROUND_OFF)
+
+
+@pytest.mark.parametrize("recordings", [1, 2, 3])
+def test_members_in_some_recordings_share_what_their_target_has(recordings):
+    """Where all explain alike, every effect and target keeps its price however many choices of recordings there are,
+    half of it for all of them; an impulse, at one time, is in one recording and each is as likely."""
+    problem, members = made(recordings), []
+    for m in problem.searched:
+        once = problem.candidate(m).effect.name == "impulse" and recordings > 1
+        variants = [v for v in problem.variants(m) if not once or len(problem.members[v].recordings) == 1]
+        members += variants if once else [m, *variants]
+    fits = [estimate(problem, (), 1.0, kind) for kind in ("white", "coloured", "force")]
+    p = posterior(problem, found(problem, *fits, *(estimate(problem, (m,), 1.0) for m in members)), 1.0)
+    assert p.as_it_is == pytest.approx(0.5, rel=1e-9) and p.unexplained == pytest.approx(0.5 / FAMILIES, rel=1e-9)
+    whole, part = {}, {}
+    for w in p.named:
+        (m,) = w.combination
+        share = whole if len(problem.members[m].recordings) == recordings else part
+        share[problem.whole(m)] = share.get(problem.whole(m), 0.0) + w.probability
+    for m in problem.searched:
+        total = whole.get(m, 0.0) + part.get(m, 0.0)
+        assert total == pytest.approx(0.5 * price(problem, m), rel=1e-9)
+        halves = recordings > 1 and problem.candidate(m).effect.name != "impulse"
+        assert not halves or whole[m] == pytest.approx(total / 2, rel=1e-9)
+    subsets = {problem.members[m].recordings for m in members}
+    # All, each one alone, and all but one.
+    assert len(subsets) == {1: 1, 2: 3, 3: 7}[recordings]
 
 
 def test_a_narrower_search_shares_among_what_is_left():
@@ -101,7 +169,8 @@ def test_probabilities_add_to_one_and_come_likeliest_first(problem):
     p = posterior(problem, found(problem, *fits), 1.0)
     named = [w.probability for w in p.named]
     assert p.as_it_is + p.unexplained + sum(named) == pytest.approx(1.0, rel=ROUND_OFF)
-    assert named == sorted(named, reverse=True) and len(named) == 18 + 18 * 17 // 2
+    n = len(problem.searched)
+    assert named == sorted(named, reverse=True) and len(named) == n + n * (n - 1) // 2
 
 
 def test_a_combination_pays_every_members_price(problem):
@@ -109,7 +178,7 @@ def test_a_combination_pays_every_members_price(problem):
     pair = (place(problem, "viscous_damping", "q1"), place(problem, "sensor_gain", "b"))
     p = posterior(problem, found(problem, estimate(problem, (), -3.0), estimate(problem, pair, 2.0)), 1.0)
     odds = p.named[0].probability / p.as_it_is
-    assert odds == pytest.approx(1 / 24 * 1 / 16 * np.exp(5.0), rel=1e-9)
+    assert odds == pytest.approx(DAMPING * GAIN * np.exp(5.0), rel=1e-9)
 
 
 def test_a_remainder_beside_a_finding_costs_its_familys_share(problem):
@@ -117,7 +186,7 @@ def test_a_remainder_beside_a_finding_costs_its_familys_share(problem):
     one = (place(problem, "viscous_damping", "q1"),)
     kinds = [estimate(problem, one, value, kind) for kind, value in (("white", 0.0), ("coloured", 3.0), ("force", 1.0))]
     p = posterior(problem, found(problem, estimate(problem, (), 0.0), *kinds), 1.0)
-    expected = 1 / 24 * (1 + 1 / FAMILIES * (np.exp(3.0) + np.exp(1.0)) / 2)
+    expected = DAMPING * (1 + 1 / FAMILIES * (np.exp(3.0) + np.exp(1.0)) / 2)
     assert p.named[0].probability / p.as_it_is == pytest.approx(expected, rel=1e-9)
     assert p.named[0].best.kind == "coloured"
 
@@ -128,7 +197,7 @@ def test_what_the_recording_says_nothing_of_is_not_weighed(problem):
     fits = [estimate(problem, (), 0.0), estimate(problem, (known,), 0.0), estimate(problem, (blind,), 9.0, sd=0.95)]
     pair = tuple(sorted((known, blind)))
     both = estimate(problem, pair, 9.0)
-    slot = problem.head + problem.calibrated.size + pair.index(blind)
+    slot = problem.slots + pair.index(blind)
     wide = both.covariance.copy()
     wide[slot, slot] = 0.9
     p = posterior(problem, found(problem, *fits, replace(both, covariance=wide)), 1.0)
@@ -142,7 +211,7 @@ def test_how_wide_is_measured_in_each_effects_own_prior(problem):
     fits = found(problem, estimate(problem, (), 0.0), estimate(problem, (one,), 0.0, sd=0.9))
     assert not posterior(problem, fits, 1.0).named
     scales = fits.priors.scales.copy()
-    scales[one] = 10.0
+    scales[problem.candidate(one).first] = 10.0
     fits.priors = replace(fits.priors, scales=scales)
     assert len(posterior(problem, fits, 1.0).named) == 1
 
@@ -153,7 +222,7 @@ def test_a_remainder_that_is_not_white_tempers_every_evidence(problem):
     fits = found(problem, estimate(problem, (), -20.0), estimate(problem, one, 0.0))
     for inflation, evidence in ((4.0, 5.0), (1.0, 20.0), (0.5, 20.0)):
         p = posterior(problem, fits, inflation)
-        assert np.log(p.named[0].probability / p.as_it_is) == pytest.approx(np.log(1 / 24) + evidence, rel=1e-9)
+        assert np.log(p.named[0].probability / p.as_it_is) == pytest.approx(np.log(DAMPING) + evidence, rel=1e-9)
         assert p.tempered == pytest.approx(evidence / 20.0)
 
 
@@ -172,3 +241,13 @@ def test_of_two_estimates_of_one_kind_the_better_counts(problem):
     for values in ((1.0, 2.0), (2.0, 1.0)):
         kept = found(problem, *(estimate(problem, one, v) for v in values))
         assert kept.best(one) == 2.0 and len(kept.estimates[one]) == 1
+
+
+def test_optima_at_different_times_add_up(problem):
+    """Two impulses at times that are far apart are two modes of one effect; the same one from two starts is one."""
+    one = place(problem, "impulse", "q1")
+    early, late = (estimate(problem, (one,), value) for value in (1.0, 2.0))
+    late.z[problem.slots + 1] = 5.0  # five hundred of its standard deviations later
+    kept = found(problem, early, late, early)
+    assert kept.best((one,)) == pytest.approx(np.logaddexp(1.0, 2.0))
+    assert kept.estimates[(one,)][0].z[problem.slots + 1] == 5.0

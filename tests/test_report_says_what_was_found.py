@@ -11,11 +11,12 @@ import report_cases as cases
 from PIL import Image
 from rich.console import Console
 
-from symplearn._effects import EFFECTS
+from symplearn._vocabulary import VOCABULARY
 from symplearn.report import html_report, summary
 from symplearn.report._decimate import envelope
-from symplearn.report._equation import parts
-from symplearn.report._law import added_force
+from symplearn.report._equation import equation_pairs, parts
+from symplearn.report._force import missing
+from symplearn.report._law import Motion, added_force
 from symplearn.report._motion import channel, close_up_window, motion_panels
 from symplearn.report._palette import AFTER, BEFORE, READING, SHADE
 from symplearn.report._panel import limits
@@ -81,7 +82,7 @@ def test_numbers_are_those_of_the_document(page):
     assert (name, float(mean)) == ("c", pytest.approx(0.00090321, rel=5e-4))
     assert float(sd) == pytest.approx(0.0000213, rel=5e-2)
     assert [float(end) for end in ends.split(" to ")] == [0.00086, 0.00094]
-    assert unit == "(kg m²/s)/rad"
+    assert unit == "kg·m²/(s·rad)"
     assert cases.SENTENCE in text_of(page, "findings")
 
 
@@ -254,48 +255,145 @@ def test_the_close_up_shows_ten_cycles():
     assert 10 / 7 <= last - first <= 11 / 7 + 0.01
 
 
-def test_the_drawn_law_is_the_contract_s():
-    """The force drawn for each effect is the formula of the contract, written out here by hand."""
-    q, v, c = np.linspace(-1, 1, 7), np.linspace(2, -3, 7), 0.4
-    by_hand = {
-        "viscous_damping": -c * v,
-        "quadratic_drag": -c * np.abs(v) * v,
-        "coulomb_friction": -c * np.sign(v),
-        "constant_force": c + 0 * q,
-        "linear_stiffness": -c * q,
-        "quadratic_stiffness": -c * q**2,
-        "cubic_stiffness": -c * q**3,
+X, Y, V, W, T = (np.random.default_rng(1).normal(size=(5, 7)) * [[1.0], [1.0], [2.0], [2.0], [9.0]]).tolist()
+X, Y, V, W, T = map(np.array, (X, Y, V, W, T))
+# Effect, side, coefficients, and by hand the force on x and on y; the pair is (x, y).
+LAWS_BY_HAND = [
+    ("viscous_damping", None, {"c": 0.4}, -0.4 * V, None),
+    ("quadratic_drag", None, {"c": 0.4}, -0.4 * np.sign(V) * V**2, None),
+    ("coulomb_friction", None, {"f": 0.4}, np.where(V > 0, -0.4, 0.4), None),
+    ("relative_damping", None, {"c": 0.4}, 0.4 * W - 0.4 * V, 0.4 * V - 0.4 * W),
+    ("self_excitation", None, {"c": 0.4, "a": 0.5}, 0.4 * V - 1.6 * X**2 * V, None),
+    ("constant_force", None, {"f": 0.4}, 0.4 + 0 * X, None),
+    ("linear_stiffness", None, {"k": 0.4}, -0.4 * X, None),
+    ("quadratic_stiffness", None, {"k": 0.4}, -0.4 * X**2, None),
+    ("cubic_stiffness", None, {"k": 0.4}, -0.4 * X**3, None),
+    ("coupling_spring", None, {"k": 0.4}, 0.4 * Y - 0.4 * X, 0.4 * X - 0.4 * Y),
+    ("contact_stop", "upper", {"k": 0.4, "a": 0.1}, np.where(X > 0.1, 0.04 - 0.4 * X, 0), None),
+    ("contact_stop", "lower", {"k": 0.4, "a": 0.1}, np.where(X < 0.1, 0.04 - 0.4 * X, 0), None),
+    (
+        "central_correction",
+        None,
+        {"b": 0.4},
+        -1.2 * X * (X**2 + Y**2) ** -2.5,
+        -1.2 * Y * (X**2 + Y**2) ** -2.5,
+    ),
+    ("gyroscopic_coupling", None, {"b": 0.4}, 0.4 * W, -0.4 * V),
+    (
+        "periodic_forcing",
+        None,
+        {"a": 0.4, "omega": 2.0, "phi": 0.3},
+        0.4 * np.cos(0.3) * np.cos(2 * T) - 0.4 * np.sin(0.3) * np.sin(2 * T),
+        None,
+    ),
+]
+
+
+@pytest.mark.parametrize(("effect", "side", "coefficients", "on_x", "on_y"), LAWS_BY_HAND)
+def test_the_drawn_law_is_the_contract_s(effect, side, coefficients, on_x, on_y):
+    """The force drawn for each effect, on either coordinate of a pair, is the contract's, written out here by hand."""
+    motion = Motion(T, np.stack([Y, X], 1), np.stack([W, V], 1))
+    estimates = {name: {"mean": value} for name, value in coefficients.items()}
+    finding = {
+        "effect": effect,
+        "target": "x" if on_y is None else ["x", "y"],
+        "recordings": [2],
+        "coefficients": estimates | ({"side": side} if side else {}),
     }
-    for effect, force in by_hand.items():
-        finding = {
-            "effect": effect,
-            "target": "x",
-            "recordings": [2],
-            "coefficients": {EFFECTS[effect].coefficient: {"mean": c}},
-        }
-        # Same arithmetic in another order: a few units in the last place.
-        np.testing.assert_allclose(added_force([finding], "x", q, v, 2), force, rtol=1e-15, atol=1e-15)
-        assert added_force([finding], "x", q, v, 1) is None
-        assert added_force([finding], "y", q, v, 2) is None
+    for coordinate, force in (("x", on_x), ("y", on_y)):
+        drawn = added_force([finding], ("y", "x"), coordinate, motion, 2)
+        if force is None:
+            assert drawn is None
+        else:
+            # Same arithmetic in another order: a few units in the last place of the largest term.
+            np.testing.assert_allclose(drawn, force, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(added_force([finding] * 2, ("y", "x"), coordinate, motion, 2), 2 * drawn)
+    assert added_force([finding], ("y", "x"), "x", motion, 1) is None
+
+
+def test_what_is_no_force_of_the_motion_is_not_drawn():
+    """All but the laws above: jumps, hidden coordinates, changed parameters, sensors, unnamed expressions."""
+    motion, drawn = Motion(T, X[:, None], V[:, None]), {law[0] for law in LAWS_BY_HAND}
+    for effect in set(VOCABULARY) - drawn:
+        finding = {"effect": effect, "target": "x", "coefficients": {}}
+        assert added_force([finding], ("x",), "x", motion, 1) is None
+    assert len(drawn) == 14
 
 
 def test_units_of_coefficients_follow_from_the_law():
     """A force is p / t and a speed q / t; where a unit is unknown, nothing is said."""
     record = cases.damped_pendulum(units={"theta": "m", "p": "N", "t": "s", "angle_deg": "V"})
     expected = {
-        "viscous_damping": "N/m",
-        "quadratic_drag": "N·s/m²",
-        "coulomb_friction": "N/s",
-        "constant_force": "N/s",
-        "linear_stiffness": "N/(m·s)",
-        "cubic_stiffness": "N/(m³·s)",
+        ("viscous_damping", "c"): "N/m",
+        ("quadratic_drag", "c"): "N·s/m²",
+        ("coulomb_friction", "f"): "N/s",
+        ("constant_force", "f"): "N/s",
+        ("linear_stiffness", "k"): "N/(m·s)",
+        ("cubic_stiffness", "k"): "N/(m³·s)",
+        ("impulse", "j"): "N",
+        ("impulse", "t_star"): "s",
+        ("viscous_damping", "k"): None,
+        ("unnamed_force", "expression"): None,
     }
-    for effect, unit in expected.items():
-        assert coefficient_unit({"effect": effect, "target": "theta"}, record) == unit
-    assert coefficient_unit({"effect": "sensor_bias", "target": "angle_deg"}, record) == "V"
-    assert coefficient_unit({"effect": "sensor_gain", "target": "angle_deg"}, record) is None
+    for (effect, name), unit in expected.items():
+        assert coefficient_unit({"effect": effect, "target": "theta"}, record, name) == unit
+    assert coefficient_unit({"effect": "sensor_bias", "target": "angle_deg"}, record, "b") == "V"
+    assert coefficient_unit({"effect": "sensor_drift", "target": "angle_deg"}, record, "r") == "V/s"
+    assert coefficient_unit({"effect": "sensor_gain", "target": "angle_deg"}, record, "g") == ""
     unknown = dataclasses.replace(record, units={"theta": "m"})
-    assert coefficient_unit({"effect": "viscous_damping", "target": "theta"}, unknown) is None
+    assert coefficient_unit({"effect": "viscous_damping", "target": "theta"}, unknown, "c") is None
+
+
+def test_every_coefficient_of_a_finding_has_its_row():
+    """Pairs, sides, coefficients with their own units, and recordings that an effect is not in, are all said."""
+    page = html_report(cases.two_masses())
+    rows = [row for row in rows_of(page, "findings") if row[0] != "Coefficient"]
+    assert rows == [
+        ["k", "3.1", "0.1", "2.9 to 3.3", "N/m"],
+        ["k", "40", "2", "36 to 44", "N/m"],
+        ["a", "0.7", "0.01", "0.68 to 0.72", "m"],
+        ["side", "lower", "–", "–", ""],
+        ["a", "0.2", "0.02", "0.16 to 0.24", "N"],
+        ["omega", "2.1", "0.01", "2.08 to 2.12", "rad/s"],
+        ["phi", "0.3", "0.05", "0.2 to 0.4", "rad"],
+        ["expression", "-0.1*x**3", "–", "–"],
+    ]
+    headings = re.findall(
+        r"<h3>(.*?)</h3>", re.search(r'<section id="findings">.*?</section>', page, re.DOTALL).group()
+    )
+    assert headings == [
+        "coupling spring between x and y",
+        "lower contact stop on y in recording 2 only",
+        "periodic forcing on x",
+        "unnamed force on x",
+    ]
+    where = text_of(page, "where")
+    assert "On x and y, y, x" in where
+    assert "0 to 3 s in recording 1; 1.5 to 3 s in recording 2" in where
+    assert "parameter drift of m, sensor bias of left in recording 1 only" in text_of(page, "remains")
+
+
+def test_a_pair_s_force_is_drawn_on_both_coordinates():
+    """The spring between x and y is part of the law on either; the stop only in its own recording."""
+    record = cases.two_masses()
+    for number, series in enumerate(record.series, start=1):
+        x, y = series.position.T
+        push = -3.1 * (x - y)
+        forcing = 0.2 * np.cos(2.1 * series.fitted_times + 0.3)
+        np.testing.assert_allclose(missing(record, series, number, "x").law, push + forcing)
+        stop = 40 * np.maximum(0.7 - y, 0) if number == 2 else 0
+        np.testing.assert_allclose(missing(record, series, number, "y").law, stop - push)
+
+
+def test_new_equations_do_not_shift_the_old_ones():
+    """A line that has no like before is new as a whole; the others keep their partner."""
+    before = ("H = p**2/2", "dp/dt = -dH/dq", "y = q")
+    after = ("H = p**2/2", "dp/dt = -dH/dq + 0.4 z", "dz/dt = P_z", "y = 1.1 (q)", "scatter of y: sd -> 2 sd")
+    pairs = equation_pairs(before, after)
+    assert [old for old, _ in pairs] == ["H = p**2/2", "dp/dt = -dH/dq", "", "y = q", ""]
+    assert ["".join(part.text for part in now) for _, now in pairs] == list(after)
+    assert pairs[2][1] == [("dz/dt = P_z", True)]
+    assert pairs[0][1] == [("H = p**2/2", False)]
 
 
 def test_the_terminal_says_it_in_a_few_plain_lines(tmp_path):

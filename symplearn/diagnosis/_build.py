@@ -1,15 +1,17 @@
 """From a simulation file and its recordings to the problem that is fitted."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
+import sympy
 
 import integrators as ig
 
 from .._augmented import Equations, equations
-from .._effects import EFFECTS, Candidate
+from .._augmented_flow import Midway
+from .._effects import DELAY, EFFECTS, ERROR, HIDDEN, NOISE, OUTLIERS, Candidate, Effect
 from .._errors import InputError, nearest, shown
 from .._expression import symbol
 from .._recording import Recording
@@ -18,7 +20,8 @@ from .._simulation_records import Quantity, SimulationFile
 from .._symbolic import TooLarge
 from .._terms import mechanics, noise_factor
 from .._thinning import highest_frequency
-from ._problem import Calibrated, InitialPrior, Problem
+from .._vocabulary import PARAMETER
+from ._problem import Calibrated, Combination, InitialPrior, Problem
 from ._stochastic import free_run
 from ._trajectory import courses
 
@@ -42,25 +45,34 @@ class Restriction:
     def allows(self, candidate: Candidate) -> bool:
         """Whether a candidate may be reported."""
         named = self.effects is None or candidate.effect.name in self.effects
-        return named and (self.sensor if candidate.effect.family == "sensor" else self.dynamics)
+        return named and (self.dynamics if candidate.effect.is_dynamics else self.sensor)
+
+    def has(self, effect: Effect) -> bool:
+        """Whether an effect is searched on any target."""
+        return self.allows(Candidate(effect, ("",), (0,)))
 
 
-def augmented_equations(file: SimulationFile, start: float = 0.0) -> Equations:
-    """The augmented simulation of a file whose first row used is at time `start`.
+def augmented_equations(
+    file: SimulationFile,
+    start: float = 0.0,
+    restriction: Restriction = Restriction(),
+    origin: float | None = None,
+    unnamed: Mapping[int, tuple[sympy.Expr, ...]] | None = None,
+) -> Equations:
+    """The augmented simulation of a file whose first row used is at time `start`; phases inside count from `origin`.
 
     `InputError` where its Hamiltonian is too large to differentiate.
     """
+    delayed = any(term.effect == DELAY.name for term in file.terms)
     try:
-        known = mechanics(file, start)
         built = equations(
-            known.coordinates,
-            known.momenta,
-            known.hamiltonian,
+            mechanics(file, start),
             [symbol(name) for name in file.parameters],
             [symbol(name) for name in file.recording.inputs],
-            known.forces,
-            known.readings,
-            known.drifts,
+            hidden=restriction.has(HIDDEN),
+            delayed=delayed or restriction.has(DELAY),
+            origin=origin,
+            unnamed=unnamed,
         )
     except TooLarge:
         raise InputError(
@@ -95,33 +107,56 @@ def build(
     """Lay the recordings out and gather every prior."""
     # A prior of the initial state belongs to the first row, which must then stay.
     rows = tuple(lay_out(recordings, holdout, bin_width(recordings), substep, shorten=not file.initial))
-    known, calibrated = _terms(file, built, len(recordings))
+    parameters, known, calibrated = _values(file, built, len(recordings))
     used = max(float(np.max(r.spans.step)) for r in rows)
     return Problem(
         equations=built,
         integrator=_integrator(file, built, used),
         rows=rows,
-        parameters=np.array([q.value for q in file.parameters.values()], float),
+        parameters=parameters,
         terms=known,
         calibrated=calibrated,
-        initial=_initial(file),
+        initial=_initial(file, built),
         noise=np.array([file.recording.noise.get(c, np.nan) * noise_factor(file, c) for c in built.columns], float),
-        searched=tuple(i for i, c in enumerate(built.candidates) if restriction.allows(c)),
+        searched=tuple(
+            i for i, c in enumerate(built.candidates) if not c.terms and restriction.allows(c) and _is_open(file, c)
+        ),
         units=dict(file.units),
+        known_outliers=tuple(
+            j
+            for j, c in enumerate(built.columns)
+            if any(t.effect == OUTLIERS.name and t.target == (c,) for t in file.terms)
+        ),
     )
 
 
+def _is_open(file: SimulationFile, candidate: Candidate) -> bool:
+    """Whether the simulation leaves room for an effect: a noise can be wrong only where it is given, a parameter only
+    where it is known, and nothing multiplies a parameter that is zero."""
+    (target, *_) = candidate.targets
+    if candidate.effect is NOISE:
+        return target in file.recording.noise
+    if candidate.effect.acts_on != PARAMETER:
+        return True
+    quantity = file.parameters[target]
+    return quantity.value != 0 and (quantity.known or candidate.effect is not ERROR)
+
+
 def _integrator(file: SimulationFile, built: Equations, substep: float) -> ig.AbstractIntegrator:
-    """The file's symplectic method, composed to order four so that its error stays below what is looked for."""
+    """The file's symplectic method; the flow composes it to order 4, so that its error stays below what is sought."""
     if file.integrator.name != "tao" and built.separable:
-        return ig.suzuki4(ig.Leapfrog())
-    return ig.suzuki4(ig.Tao(omega=jnp.asarray(_BINDING / substep)))
+        return Midway()
+    return ig.Tao(omega=jnp.asarray(_BINDING / substep))
 
 
-def _initial(file: SimulationFile) -> InitialPrior:
-    given = [file.initial.get(name) for name in file.states]
-    mean = [0.0 if q is None else q.value for q in given]
-    sd = [np.inf if q is None else (0.0 if q.known else _sd(q)) for q in given]
+def _initial(file: SimulationFile, built: Equations) -> InitialPrior:
+    """Priors of the file's states; a known hidden oscillator's is open, one that is searched for starts at rest."""
+    mean, sd = [], []
+    for names in (file.coordinates, file.momenta):
+        given = [file.initial.get(name) for name in names]
+        mean += [0.0 if q is None else q.value for q in given] + [0.0] * (built.width - len(names))
+        sd += [np.inf if q is None else (0.0 if q.known else _sd(q)) for q in given]
+        sd += [np.inf] * (built.dim - len(names)) + [0.0] * built.hidden
     return InitialPrior(np.array(mean), np.array(sd))
 
 
@@ -136,24 +171,39 @@ def _bounds(quantity: Quantity) -> tuple[float, float]:
     return lower, np.inf if quantity.upper is None else quantity.upper
 
 
-def _terms(file: SimulationFile, built: Equations, recordings: int) -> tuple[np.ndarray, Calibrated]:
-    """Coefficients of known terms, and everything that is calibrated: parameters, then coefficients of terms."""
-    keys = {c.key: i for i, c in enumerate(built.candidates)}
-    known = np.zeros((recordings, len(built.candidates)))
-    free = [(n, i, q, np.ones(recordings)) for i, (n, q) in enumerate(file.parameters.items()) if not q.known]
-    parameters = len(free)
+def _values(file: SimulationFile, built: Equations, recordings: int) -> tuple[np.ndarray, np.ndarray, Calibrated]:
+    """Parameters and coefficients of known terms by recording, and everything that is calibrated."""
+    further = mechanics(file, built.start).further
+    listed = [(name, quantity) for name, quantity in file.parameters.items()]
+    listed += [(one.name, one.quantity) for one in further]
+    parameters = np.tile([q.value for _, q in listed], (recordings, 1)).reshape(recordings, -1)
+    for k, one in enumerate(further, start=len(file.parameters)):
+        parameters[:, k] *= _mask(one.recordings, recordings)
+    everywhere = np.ones(recordings)
+    free = [(n, i, q, everywhere) for i, (n, q) in enumerate(listed) if not q.known]
+    number = len(free)
+    known = np.zeros((recordings, built.size))
+    firsts = {c.key: c.first for c in built.candidates}
     for term in file.terms:
-        if term.effect not in EFFECTS:
+        if not (term.effect in EFFECTS and EFFECTS[term.effect].is_additive):
             continue  # written into the equations
-        place = keys[term.effect, term.target[0]]
         ((name, quantity),) = term.coefficients.items()
-        mask = np.array([term.recordings is None or r + 1 in term.recordings for r in range(recordings)], float)
+        place, mask = firsts[term.effect, term.target], _mask(term.recordings, recordings)
         if quantity.known:
             known[:, place] += mask * quantity.value
         else:
-            free.append((f"{term.effect}({term.target[0]}).{name}", place, quantity, mask))
+            free.append((f"{term.effect}({', '.join(term.target)}).{name}", place, quantity, mask))
+    return parameters, known, _calibrated(free, number, recordings)
+
+
+def _mask(which: Sequence[int] | None, recordings: int) -> np.ndarray:
+    """One for each recording that a term is in, which are counted from 1."""
+    return np.array([which is None or r + 1 in which for r in range(recordings)], float)
+
+
+def _calibrated(free: Sequence[tuple[str, int, Quantity, np.ndarray]], parameters: int, recordings: int) -> Calibrated:
     bounds = np.array([_bounds(q) for _, _, q, _ in free]).reshape(-1, 2)
-    return known, Calibrated(
+    return Calibrated(
         names=tuple(n for n, _, _, _ in free),
         place=np.array([i for _, i, _, _ in free], int),
         parameters=parameters,
@@ -186,26 +236,31 @@ def rows_fitted(rows: Sequence[Rows]) -> list[int]:
 
 
 def refined(
-    rebuild: Callable[[float], Problem], problem: Problem, z: np.ndarray, noise: np.ndarray, substep: float
-) -> Problem:
+    rebuild: Callable[[float], Problem],
+    problem: Problem,
+    z: np.ndarray,
+    noise: np.ndarray,
+    substep: float,
+    combination: Combination = (),
+) -> tuple[Problem, float]:
     """Halve the substep until the readings of a trajectory change by far less than their noise, at most five times.
 
-    `rebuild` lays the problem out again with another longest substep.
+    `rebuild` lays the problem out again with another longest substep, which is returned with it.
     """
-    coarse = _trajectories(problem, z)
+    coarse = _trajectories(problem, z, combination)
     for _ in range(_HALVINGS):
         finer = rebuild(substep / 2)
-        fine = _trajectories(finer, z)
+        fine = _trajectories(finer, z, combination)
         change = np.max([np.max(np.abs(a - b), axis=0) for a, b in zip(coarse, fine, strict=True)], axis=0)
         if not np.isfinite(change).all() or (change < _CHANGE * noise).all():
-            return problem
+            break
         problem, coarse, substep = finer, fine, substep / 2
-    return problem
+    return problem, substep
 
 
-def _trajectories(problem: Problem, z: np.ndarray) -> list[np.ndarray]:
+def _trajectories(problem: Problem, z: np.ndarray, combination: Combination) -> list[np.ndarray]:
     out = []
     for r, course in enumerate(courses(problem)):
         x = z[r * problem.state : (r + 1) * problem.state]
-        out.append(free_run(problem, course, z, (), r, x, 0)[0][: problem.rows[r].fitted])
+        out.append(free_run(problem, course, z, combination, r, x, 0)[0][: problem.rows[r].fitted])
     return out

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .._effects import HIDDEN
 from ._problem import Combination, Problem
 from ._trajectory import Predictions, Stepper
 
@@ -21,19 +22,48 @@ _PATIENCE, _HOPELESS = 6, 500.0
 
 @dataclass(frozen=True)
 class Priors:
-    """Gaussian priors of z under every combination: calibrated values and initial states; effects by `scales`."""
+    """Gaussian priors of z under every combination: initial states and calibrated values, and the values of effects.
+
+    `centres` and `scales` are by entry of the coefficient vector; `unseen` is the prior sd of the start of an unseen
+    oscillator. `lower` and `upper` bound where an effect may be placed, by entry of the coefficient vector.
+    """
 
     mean: Float[np.ndarray, " z"]
     precision: Float[np.ndarray, " z"]
-    scales: Float[np.ndarray, " candidate"]
+    centres: Float[np.ndarray, " coefficient"]
+    scales: Float[np.ndarray, " coefficient"]
+    lower: Float[np.ndarray, " coefficient"]
+    upper: Float[np.ndarray, " coefficient"]
+    unseen: Float[np.ndarray, "2"]
 
     def precision_of(self, problem: Problem, combination: Combination) -> Float[np.ndarray, " z"]:
-        """Prior precisions with the slots' entries filled in."""
+        """Prior precisions with the entries of a combination filled in."""
         values = self.precision.copy()
-        first = problem.head + problem.calibrated.size
-        for slot, candidate in enumerate(combination):
-            values[first + slot] = self.scales[candidate] ** -2.0
+        for member, place in problem.placed(combination):
+            values[place] = self.scales[problem.candidate(member).values] ** -2.0
+            if problem.candidate(member).effect is HIDDEN:
+                for r in problem.members[member].recordings:
+                    values[problem.unseen(r)] = self.unseen**-2.0
         return values
+
+    def mean_of(self, problem: Problem, combination: Combination) -> Float[np.ndarray, " z"]:
+        """Prior means with the entries of a combination filled in."""
+        return self._filled(problem, combination, self.mean, self.centres)
+
+    def bounds_of(self, problem: Problem, combination: Combination) -> tuple[np.ndarray, np.ndarray]:
+        """Between which values each entry of z stays in a fit."""
+        c, free = problem.calibrated, np.full(problem.size, np.inf)
+        lower, upper = -free, free.copy()
+        lower[problem.head : problem.slots], upper[problem.head : problem.slots] = c.lower, c.upper
+        lower = self._filled(problem, combination, lower, self.lower)
+        return lower, self._filled(problem, combination, upper, self.upper)
+
+    @staticmethod
+    def _filled(problem: Problem, combination: Combination, z: np.ndarray, values: np.ndarray) -> np.ndarray:
+        z = z.copy()
+        for member, place in problem.placed(combination):
+            z[place] = values[problem.candidate(member).values]
+        return z
 
 
 @dataclass(frozen=True)
@@ -48,7 +78,7 @@ class Fits:
     converged: Bool[np.ndarray, " lane"]
 
 
-def weights(problem: Problem, rows: Sequence[int]) -> list[Float[np.ndarray, "time channel"]]:
+def weights(problem: Problem, rows: Sequence[int]) -> list[Float[np.ndarray, "_ channel"]]:
     """Readings averaged in every row, in units of one reading's information; 0 where there is none."""
     out = []
     for r, n in zip(problem.rows, rows, strict=True):
@@ -66,8 +96,10 @@ def residuals(problem: Problem, predictions: list[Predictions], weight: list[np.
     return out
 
 
-def estimate_noise(problem: Problem, r: list[np.ndarray], weight: list[np.ndarray]) -> np.ndarray:
-    """Noise sd of one reading by lane and channel: known where the file knows it, else the residuals' rms."""
+def estimate_noise(
+    problem: Problem, combinations: Sequence[Combination], r: list[np.ndarray], weight: list[np.ndarray]
+) -> np.ndarray:
+    """Noise sd of one reading by lane and channel: known where the combination trusts it, else the residuals' rms."""
     with np.errstate(over="ignore", invalid="ignore"):  # a lane that diverged is told by its cost
         square = sum((w * x**2).sum(1) for w, x in zip(weight, r, strict=True))
     number = sum((w > 0).sum(0) for w in weight)
@@ -75,7 +107,8 @@ def estimate_noise(problem: Problem, r: list[np.ndarray], weight: list[np.ndarra
                              for w, rows in zip(weight, problem.rows, strict=True)])  # fmt: skip
     floor = _FLOOR * np.maximum(np.nanmax(np.abs(spread), axis=0), 1e-300)
     estimated = np.maximum(np.sqrt(square / np.maximum(number, 1)), floor)
-    return np.where(np.isnan(problem.noise), estimated, problem.noise)
+    known = np.stack([problem.noise_of(c) for c in combinations])
+    return np.where(np.isnan(known), estimated, known)
 
 
 def grow(
@@ -85,12 +118,17 @@ def grow(
     priors: Priors,
     windows: Sequence[Sequence[int]],
     final: int = 40,
+    held: Bool[np.ndarray, " lane"] | None = None,
 ) -> Fits:
-    """Fit in one window after the other, each from the one before, the last to convergence."""
+    """Fit in one window after the other, each from the one before, the last to convergence.
+
+    In lanes that are `held` the values of the effects stay as they start until the last window: an early one may say
+    nothing of them.
+    """
     z = start
     for number, rows in enumerate(windows):
         last = number == len(windows) - 1
-        fits = calibrate(stepper, z, combinations, priors, rows, final if last else 12)
+        fits = calibrate(stepper, z, combinations, priors, rows, final if last else 12, held=None if last else held)
         z = fits.z
     return fits
 
@@ -103,31 +141,44 @@ def calibrate(
     rows: Sequence[int],
     iterations: int = 40,
     tolerance: float = 1e-3,
+    held: Bool[np.ndarray, " lane"] | None = None,
 ) -> Fits:
     """Levenberg-Marquardt over the first `rows` rows of every recording.
 
-    A lane has converged when an undamped step promises less than `tolerance` of minus twice the log posterior.
+    A lane has converged when an undamped step promises less than `tolerance` of minus twice the log posterior. The
+    values of effects do not move in lanes that are `held`.
     """
     problem, lanes = stepper.problem, len(start)
     weight = weights(problem, rows)
     precision = np.stack([priors.precision_of(problem, c) for c in combinations])
+    mean = np.stack([priors.mean_of(problem, c) for c in combinations])
+    bounds = np.stack([priors.bounds_of(problem, c) for c in combinations])
     active = np.stack([problem.active(c) for c in combinations])
+    if held is not None:
+        active[held, problem.slots :] = False
     fits = _evaluated(stepper, np.array(start, float), list(combinations), rows, weight)
     damping, done, stuck = np.full(lanes, 1e-3), np.zeros(lanes, bool), np.zeros(lanes, bool)
-    fits = _costed(problem, fits, weight, precision, priors.mean)
+    fits = _costed(problem, fits, weight, precision, mean)
     for count in range(iterations):
-        step, promised = _steps(problem, fits, weight, precision, priors.mean, active, damping)
-        done |= promised < tolerance
+        some = np.nonzero(~done)[0]  # lanes that have converged are not stepped again
+        mine = _chosen(fits, some)
+        given = precision[some], mean[some], active[some], bounds[some], damping[some]
+        step, promised = _steps(problem, mine, weight, *given)
+        done[some] = promised < tolerance
         if done.all():
             break
-        trial_z = _bounded(problem, fits.z + np.where(done[:, None], 0.0, step))
-        trial = _evaluated(stepper, trial_z, fits.combinations, rows, weight)
-        trial = _costed(problem, replace(trial, noise=fits.noise), weight, precision, priors.mean)
-        better = trial.cost <= fits.cost
-        merged = _merged(fits, trial, better)
-        merged = replace(merged, noise=estimate_noise(problem, residuals(problem, merged.predictions, weight), weight))
-        fits = _costed(problem, merged, weight, precision, priors.mean)
-        damping = np.clip(np.where(better, damping / 10, damping * 5), 1e-9, 1e12)
+        some, mine, step = some[~done[some]], _chosen(mine, ~done[some]), step[~done[some]]
+        moved = np.clip(mine.z + step, bounds[some, 0], bounds[some, 1])
+        trial = replace(_evaluated(stepper, moved, mine.combinations, rows, weight), noise=mine.noise)
+        trial = _costed(problem, trial, weight, precision[some], mean[some])
+        better = trial.cost <= mine.cost
+        good = some[better]
+        if len(good):
+            kept = _chosen(trial, better)
+            r = residuals(problem, kept.predictions, weight)
+            kept = replace(kept, noise=estimate_noise(problem, kept.combinations, r, weight))
+            _put(fits, good, _costed(problem, kept, weight, precision[good], mean[good]))
+        damping[some] = np.clip(np.where(better, damping[some] / 10, damping[some] * 5), 1e-9, 1e12)
         stuck |= damping > 1e8
         done |= stuck
         if count >= _PATIENCE:
@@ -138,6 +189,21 @@ def calibrate(
     return replace(fits, converged=done & ~stuck & np.isfinite(fits.cost))
 
 
+def _chosen(fits: Fits, lanes: np.ndarray) -> Fits:
+    """Some of the lanes."""
+    places = np.arange(len(fits.z))[lanes]
+    predictions = [Predictions(p.readings[lanes], p.slopes[lanes]) for p in fits.predictions]
+    combinations = [fits.combinations[k] for k in places]
+    return Fits(combinations, fits.z[lanes], fits.noise[lanes], predictions, fits.cost[lanes], fits.converged[lanes])
+
+
+def _put(fits: Fits, lanes: np.ndarray, new: Fits) -> None:
+    """Write lanes back."""
+    fits.z[lanes], fits.noise[lanes], fits.cost[lanes] = new.z, new.noise, new.cost
+    for old, one in zip(fits.predictions, new.predictions, strict=True):
+        old.readings[lanes], old.slopes[lanes] = one.readings, one.slopes
+
+
 def _log_noise(problem: Problem, noise: np.ndarray, weight: list[np.ndarray]) -> np.ndarray:
     """Sum over readings of the log noise, by lane."""
     number = sum((w > 0).sum(0) for w in weight)
@@ -146,7 +212,8 @@ def _log_noise(problem: Problem, noise: np.ndarray, weight: list[np.ndarray]) ->
 
 def _evaluated(stepper, z, combinations, rows, weight) -> Fits:
     predictions = stepper.predict(z, combinations, rows)
-    noise = estimate_noise(stepper.problem, residuals(stepper.problem, predictions, weight), weight)
+    r = residuals(stepper.problem, predictions, weight)
+    noise = estimate_noise(stepper.problem, combinations, r, weight)
     lanes = len(z)
     return Fits(combinations, z, noise, predictions, np.full(lanes, np.inf), np.zeros(lanes, bool))
 
@@ -176,11 +243,13 @@ def normal_equations(
     return matrix, vector
 
 
-def _steps(problem, fits: Fits, weight, precision, mean, active, damping) -> tuple[np.ndarray, np.ndarray]:
+def _steps(problem, fits: Fits, weight, precision, mean, active, bounds, damping) -> tuple[np.ndarray, np.ndarray]:
     """Damped Gauss-Newton steps, and what an undamped one promises to take off the cost."""
     with np.errstate(over="ignore", invalid="ignore"):
         matrix, vector = normal_equations(problem, fits, weight)
     vector = vector - precision * (fits.z - mean)
+    # What stands at a bound and is pushed against it stays there.
+    active = active & ~((fits.z <= bounds[:, 0]) & (vector < 0)) & ~((fits.z >= bounds[:, 1]) & (vector > 0))
     steps, promised = np.zeros_like(fits.z), np.full(len(fits.z), np.inf)
     for b in range(len(steps)):
         a = np.nonzero(active[b])[0]
@@ -194,20 +263,3 @@ def _steps(problem, fits: Fits, weight, precision, mean, active, damping) -> tup
         steps[b, a] = vectors @ (along / (values + damping[b])) / scale
         promised[b] = float((along**2 / values).sum())
     return steps, promised
-
-
-def _bounded(problem: Problem, z: np.ndarray) -> np.ndarray:
-    part = slice(problem.head, problem.head + problem.calibrated.size)
-    z[:, part] = np.clip(z[:, part], problem.calibrated.lower, problem.calibrated.upper)
-    return z
-
-
-def _merged(old: Fits, new: Fits, better: np.ndarray) -> Fits:
-    def choose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.where(better.reshape(-1, *[1] * (a.ndim - 1)), b, a)
-
-    predictions = [
-        Predictions(choose(o.readings, n.readings), choose(o.slopes, n.slopes))
-        for o, n in zip(old.predictions, new.predictions, strict=True)
-    ]
-    return replace(old, z=choose(old.z, new.z), predictions=predictions, cost=choose(old.cost, new.cost))

@@ -130,9 +130,9 @@ def _grid(times: list[np.ndarray]) -> np.ndarray:
 
 
 def fit_colour(
-    residuals: list[Float[np.ndarray, "lane time"]],
-    weight: list[Float[np.ndarray, " time"]],
-    times: list[Float[np.ndarray, " time"]],
+    residuals: list[Float[np.ndarray, "lane _"]],
+    weight: list[Float[np.ndarray, " _"]],
+    times: list[Float[np.ndarray, " _"]],
     known: float | None,
     largest: float = np.inf,
 ) -> list[Colour]:

@@ -4,10 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm, truncnorm
 
 from .._recording import Recording
-from ._locate import kind_and_targets, whole_windows
 from ._outlook import Outlook
 from ._posterior import Posterior, Weighed
 from ._problem import Problem
@@ -16,21 +14,6 @@ from ._weighed import Estimate
 # Alternatives listed one by one; the rest is `other`.
 _LISTED = 12
 _LEAST = 5e-4
-
-
-def coefficient(problem: Problem, estimate: Estimate, slot: int, inflation: float) -> dict[str, Any]:
-    """Mean, sd and 95 % interval of one slot's coefficient, cut off where its sign is physical."""
-    place = problem.head + problem.calibrated.size + slot
-    mean = float(estimate.z[place])
-    sd = float(np.sqrt(estimate.covariance[place, place] * inflation))
-    lower = problem.lower_bounds(estimate.combination).get(place)
-    if lower is None or mean - lower > 5 * sd:
-        low, high = (float(x) for x in norm.interval(0.95, mean, sd))
-    else:
-        law = truncnorm((lower - mean) / sd, np.inf, mean, sd)
-        low, high = (float(x) for x in law.ppf([0.025, 0.975]))
-        mean, sd = float(law.mean()), float(law.std())
-    return {"mean": mean, "sd": sd, "interval95": [low, high]}
 
 
 def parameters(problem: Problem, estimate: Estimate, inflation: float) -> dict[str, Any]:
@@ -95,9 +78,9 @@ def alternatives(
 
 
 def _alternative(problem: Problem, combination, unexplained: bool, probability: float) -> dict[str, Any]:
-    found = [problem.equations.candidates[c].key for c in combination]
+    found = [problem.candidate(member) for member in combination]
     return {
-        "findings": [{"effect": effect, "target": target} for effect, target in found],
+        "findings": [{"effect": one.effect.name, "target": one.target} for one in found],
         "unexplained": unexplained,
         "probability": float(probability),
     }
@@ -107,23 +90,13 @@ def family_probability(problem: Problem, posterior: Posterior) -> dict[str, floa
     """Probability that an effect of each family is present."""
     total: dict[str, float] = {}
     for w in posterior.named:
-        for family in {problem.equations.candidates[c].effect.family for c in w.combination}:
+        for family in {problem.candidate(member).effect.family for member in w.combination}:
             total[family] = min(1.0, total.get(family, 0.0) + w.probability)
     return dict(sorted(total.items(), key=lambda item: -item[1]))
 
 
-def presence(posterior: Posterior, candidate: int) -> float:
-    """Probability that one effect and target is present in any combination."""
-    return min(1.0, sum(w.probability for w in posterior.named if candidate in w.combination))
-
-
-def location(problem: Problem, combination, outlooks: Sequence[Outlook], where: str) -> dict[str, Any]:
-    """The location of a named mismatch."""
-    kind, targets = kind_and_targets(problem, combination)
-    return {
-        "kind": kind,
-        "targets": targets,
-        "recordings": [o.recording + 1 for o in outlooks],
-        "time_windows": whole_windows(outlooks),
-        "where": where,
-    }
+def presence(problem: Problem, posterior: Posterior, member: int) -> float:
+    """Probability that one effect and target is present in any combination, in whichever recordings."""
+    key = problem.candidate(member).key
+    having = (w for w in posterior.named if key in {problem.candidate(m).key for m in w.combination})
+    return min(1.0, sum(w.probability for w in having))

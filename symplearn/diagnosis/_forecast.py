@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._augmented import Span
+from .._augmented_flow import Span
 from .._errors import InputError
 from .._recording import Recording
 from .._rows import spans_between
@@ -18,7 +18,7 @@ from ._outlook import colour_ratio, intensity_of, start_spread, total_noise
 from ._problem import Problem
 from ._record import Forecast
 from ._stochastic import filter_lane, padded, row_roots, softness
-from ._trajectory import Stepper, model_at
+from ._trajectory import Stepper, effect_coefficients, model_at
 from ._weighed import Estimate
 
 _DRAWS = 128
@@ -74,7 +74,7 @@ def _draws(
     pieces = max(1, math.ceil(np.max(np.diff(path)) / float(np.max(rows.spans.step)) - 1e-9))
     inputs = np.zeros((len(times), 0)) if recording.inputs is None else recording.inputs.at(times)
     ahead = (spans_between(path, pieces, recording.inputs), jnp.asarray(times), jnp.asarray(inputs))
-    onehot, noise, length = problem.onehot(e.combination), total_noise(e), course.times.shape[0]
+    onehot, noise, length = problem.onehot(e.combination, 0), total_noise(e), course.times.shape[0]
     fixed = (jnp.asarray(noise), jnp.asarray(intensity_of(stepper, e)), jnp.asarray(softness(problem, course, e.z, 0)),
              jnp.asarray(start_spread(stepper, e, 0)), jnp.asarray(padded(rows.readings, length, np.nan)),
              jnp.asarray(row_roots(problem, 0, length, colour_ratio(e))), jnp.asarray(onehot))  # fmt: skip
@@ -102,10 +102,10 @@ def _finite(drawn: np.ndarray) -> np.ndarray:
 def _run_draws(equations: Any, integrator: Any, course: Any, zs: Array, fixed: Any, ahead: Any, keys: Array) -> Array:
     noise, intensity, soft, spread, readings, roots, onehot = fixed
     spans, times, inputs = ahead
-    state, f = 2 * equations.dim, course.to_parameters.shape[0]
+    state, f = 2 * equations.width, course.to_parameters.shape[0]
 
     def one(z: Array, key: Array) -> Array:
-        calibrated, coefficients = z[state : state + f], z[state + f :] @ onehot
+        calibrated, coefficients = z[state : state + f], effect_coefficients(z[state + f :], onehot)
         model, _, _, filtered = filter_lane(
             equations, integrator, course, calibrated, coefficients, noise, intensity, soft, z[:state], spread,
             readings, roots,
@@ -114,12 +114,12 @@ def _run_draws(equations: Any, integrator: Any, course: Any, zs: Array, fixed: A
         root = semidefinite_cholesky(filtered.filtered_covariances[-1])
         x = filtered.filtered_means[-1] + root @ jax.random.normal(first, (state,))
         flow, read = model_at(equations, integrator, course, calibrated, coefficients)
-        pushes = jax.random.normal(later, (times.shape[0], state // 2))
+        pushes = jax.random.normal(later, (times.shape[0], equations.dim))
 
         def step(x: Array, row: tuple[Span, Array, Array, Array]) -> tuple[Array, Array]:
             span, t, u, push = row
             length = span.step * span.inputs.shape[0]
-            x = flow(x, span).at[state // 2 :].add(jnp.sqrt(intensity * length) * push)
+            x = flow(x, span).at[equations.momentum].add(jnp.sqrt(intensity * length) * push)
             return x, read(x, (t, u))
 
         return jax.lax.scan(step, x, (spans, times, inputs, pushes))[1]

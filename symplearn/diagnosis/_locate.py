@@ -1,10 +1,11 @@
 """Where the mismatch lives: which equation, which sensor, which times, and what the missing force goes with."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from .._effects import IMPULSE, Candidate
 from ._outlook import Outlook
 from ._problem import Combination, Problem
 
@@ -83,10 +84,36 @@ def strained_coordinates(outlooks: Sequence[Outlook]) -> list[int]:
 
 def kind_and_targets(problem: Problem, combination: Combination) -> tuple[str, list[str]]:
     """`dynamics`, `sensor` or `both`, and the targets, in the order of the combination."""
-    chosen = [problem.equations.candidates[c] for c in combination]
-    places = {c.effect.acts_on for c in chosen}
-    kind = "both" if len(places) == 2 else ("dynamics" if "coordinate" in places else "sensor")
-    return kind, list(dict.fromkeys(c.target for c in chosen))
+    chosen = [problem.candidate(member) for member in combination]
+    places = {one.effect.is_dynamics for one in chosen}
+    kind = "both" if len(places) == 2 else ("dynamics" if True in places else "sensor")
+    return kind, list(dict.fromkeys(target for one in chosen for target in one.targets))
+
+
+def present_windows(
+    problem: Problem, outlooks: Sequence[Outlook], combination: Combination, values: Mapping[int, Mapping[str, float]]
+) -> list[list[float | int]]:
+    """When the effects of a combination are at work, by recording: at a jump, from a change on, else all the time."""
+    out: list[list[float | int]] = []
+    for o in outlooks:
+        first, last = float(o.rows.times[0]), float(o.rows.times[-1])
+        gap = float(np.median(np.diff(o.rows.times)))
+        mine = [m for m in combination if o.recording in problem.members[m].recordings]
+        windows = [_window(problem.candidate(m), values[m], first, last, gap) for m in mine]
+        if any(w == (first, last) for w in windows):
+            windows = [(first, last)]
+        number: list[float | int] = [o.recording + 1] if len(outlooks) > 1 else []
+        out += [[*w, *number] for w in sorted(dict.fromkeys(windows))]
+    return out
+
+
+def _window(one: Candidate, values: Mapping[str, float], first: float, last: float, gap: float) -> tuple[float, float]:
+    if "t_star" not in values:
+        return first, last
+    begin = min(max(values["t_star"], first), last)
+    if one.effect is IMPULSE:
+        return max(first, begin - gap), min(last, begin + gap)
+    return begin, last
 
 
 def whole_windows(outlooks: Sequence[Outlook]) -> list[list[float | int]]:

@@ -29,7 +29,7 @@ class PathFit:
     intensity: Float[np.ndarray, " d"]
     z: Float[np.ndarray, " z"]
     noise: Float[np.ndarray, " channel"]
-    paths: list[Float[np.ndarray, "time state"]]
+    paths: list[Float[np.ndarray, "_ state"]]
     laplace: Laplace | None = None
     converged: bool = False
 
@@ -53,6 +53,7 @@ def fit_paths(
 def _fit_chunk(stepper, fits: list[PathFit], priors: Priors, rows: Sequence[int], iterations: int) -> list[PathFit]:
     wanted = len(fits)
     fits = (fits * LANES)[:LANES] if wanted < LANES else fits
+    fits = [_begun(stepper.problem, fit) for fit in fits]
     weight = weights(stepper.problem, rows)
     before = np.full(LANES, -np.inf)
     for count in range(iterations):
@@ -66,12 +67,21 @@ def _fit_chunk(stepper, fits: list[PathFit], priors: Priors, rows: Sequence[int]
     return [replace(fit, converged=bool(ok)) for fit, ok in zip(fits, settled, strict=True)][:wanted]
 
 
+def _begun(problem: Problem, fit: PathFit) -> PathFit:
+    """The same with every path beginning at z's own x_0, wherever the rest of it comes from."""
+    begins = [fit.z[r * problem.state : (r + 1) * problem.state] for r in range(len(fit.paths))]
+    paths = [np.concatenate([x[None], path[1:]]) for x, path in zip(begins, fit.paths, strict=True)]
+    return replace(fit, paths=paths)
+
+
 def _iterate(stepper, fits: list[PathFit], priors: Priors, rows, weight, noisy: bool) -> list[PathFit]:
     """One forward pass, one step of the unknowns, one backward pass."""
     problem = stepper.problem
     passes = [_forward(stepper, fits, r, rows[r], weight[r]) for r in range(len(rows))]
     steps = [_integrated(problem, fits[b], [(p[2], b) for p in passes], priors, weight) for b in range(LANES)]
-    z = _clipped(problem, np.stack([fit.z + one.step for fit, one in zip(fits, steps, strict=True)]))
+    moved = np.stack([fit.z + one.step for fit, one in zip(fits, steps, strict=True)])
+    bounds = np.stack([priors.bounds_of(problem, fit.combination) for fit in fits])
+    z = np.clip(moved, bounds[:, 0], bounds[:, 1])
     moved = z - np.stack([fit.z for fit in fits])
     paths: list[list[np.ndarray]] = [[] for _ in fits]
     squares, numbers = 0.0, 0.0
@@ -85,19 +95,27 @@ def _iterate(stepper, fits: list[PathFit], priors: Priors, rows, weight, noisy: 
             paths[b].append(fit.paths[r] + shift[b])
     noise = np.stack([fit.noise for fit in fits])
     if noisy:
-        noise = _next_noise(problem, noise, squares / np.maximum(numbers, 1))
+        known = np.stack([problem.noise_of(fit.combination) for fit in fits])
+        noise = _next_noise(known, noise, squares / np.maximum(numbers, 1))
     return [replace(fit, z=z[b], noise=noise[b], paths=paths[b], laplace=steps[b]) for b, fit in enumerate(fits)]
 
 
-def _next_noise(problem: Problem, noise: np.ndarray, expected: np.ndarray) -> np.ndarray:
+def _next_noise(known: np.ndarray, noise: np.ndarray, expected: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = np.sqrt(expected) / noise
     ratio = np.where(np.isfinite(ratio), np.clip(ratio, 0.3, 3.0), 1.0)
-    return np.where(np.isnan(problem.noise), noise * ratio**_HASTE, noise)
+    return np.where(np.isnan(known), noise * ratio**_HASTE, noise)
 
 
 def _forward(stepper, fits: list[PathFit], r: int, rows: int, weight: np.ndarray):
-    problem, f, head = stepper.problem, stepper.problem.calibrated.size, stepper.problem.head
+    problem = stepper.problem
+    slots = np.stack([fit.z[problem.slots :] for fit in fits])
+    return _pass(stepper, fits, r, rows, weight, slots, np.stack([problem.onehot(fit.combination, r) for fit in fits]))
+
+
+def _pass(stepper, fits: list[PathFit], r: int, rows: int, weight: np.ndarray, slots: np.ndarray, hots: np.ndarray):
+    """Linearise one recording about every lane's path and filter it."""
+    problem = stepper.problem
     z = np.stack([fit.z for fit in fits])
     length = max(len(path) for fit in fits for path in fit.paths)
     inverse = padded(np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0), length, 0.0)
@@ -107,9 +125,9 @@ def _forward(stepper, fits: list[PathFit], r: int, rows: int, weight: np.ndarray
         problem.integrator,
         stepper.courses[r],
         jnp.asarray(np.stack([_prolonged(fit.paths[r], length) for fit in fits])),
-        jnp.asarray(z[:, head : head + f]),
-        jnp.asarray(z[:, head + f :]),
-        jnp.asarray(np.stack([problem.onehot(fit.combination) for fit in fits])),
+        jnp.asarray(z[:, problem.head : problem.slots]),
+        jnp.asarray(slots),
+        jnp.asarray(hots),
         jnp.asarray(padded(problem.rows[r].readings[:rows], length, np.nan)),
         variances,
         jnp.asarray(np.stack([fit.intensity for fit in fits])),
@@ -140,11 +158,28 @@ def _integrated(problem: Problem, fit: PathFit, passes, priors: Priors, weight) 
     if not np.isfinite(gram).all():
         return Laplace(-np.inf, np.zeros(problem.size), np.zeros((problem.size, problem.size)))
     precision = priors.precision_of(problem, fit.combination)
-    return laplace(gram, offset, fit.z, priors.mean, precision, problem.active(fit.combination),
-                   problem.lower_bounds(fit.combination))  # fmt: skip
+    return laplace(gram, offset, fit.z, priors.mean_of(problem, fit.combination), precision,
+                   problem.active(fit.combination), problem.lower_bounds(fit.combination))  # fmt: skip
 
 
-def _clipped(problem: Problem, z: np.ndarray) -> np.ndarray:
-    part = slice(problem.head, problem.head + problem.calibrated.size)
-    z[:, part] = np.clip(z[:, part], problem.calibrated.lower, problem.calibrated.upper)
-    return z
+def lane_grams(
+    stepper: Stepper, fit: PathFit, laid: Sequence[tuple[np.ndarray, np.ndarray]], rows: Sequence[int], r: int
+) -> list[np.ndarray]:
+    """Gram matrices of one recording's innovations about a path, by column [1, x_0, calibrated, slots].
+
+    **Arguments:** - `laid`: at most `LANES` times the values of the slots and the coefficients that they are.
+    """
+    problem, number = stepper.problem, len(laid)
+    fixed = problem.coefficients(r, fit.z, fit.combination) - problem.coefficients(r, fit.z, ())
+    slots, hots = [], []
+    for values, matrix in laid:
+        hot = matrix.copy()
+        hot[-1] += fixed
+        slots.append(values)
+        hots.append(hot)
+    lanes = np.arange(LANES) % number
+    weight = weights(problem, rows)[r]
+    _, done = _pass(stepper, [fit] * LANES, r, rows[r], weight, np.stack(slots)[lanes], np.stack(hots)[lanes])[::2]
+    sign = np.ones(done.gram.shape[-1])
+    sign[1:] = -1.0
+    return [np.asarray(done.gram[b]) * np.outer(sign, sign) for b in range(number)]

@@ -5,14 +5,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
 from .._filter import Filtered
 from .._smoother import Smoothed
+from ._along import along, readings
 from ._stochastic import free_run, row_roots, run_filter, run_smoother
 from ._trajectory import Stepper
 from ._weighed import Estimate
@@ -91,16 +90,12 @@ class Outlook:
     def followed(self) -> Float[np.ndarray, "fitted channel"]:
         """Readings of the filtered phase points over the fitted rows."""
         means = np.asarray(self._filtered[1].filtered_means[: self.rows.fitted])
-        return self.along(self.stepper.problem.equations.readings, means)
+        return self.along(readings, means)
 
-    def along(self, function: Callable[[Any], Any], states: Float[np.ndarray, "row state"]) -> np.ndarray:
-        """One of the compiled equations at phase points of the leading rows."""
-        p, n = self.stepper.problem, len(states)
-        coefficients = p.coefficients(self.recording, self.estimate.z, self.estimate.combination)
-        fixed = (np.broadcast_to(v, (n, len(v))) for v in (p.parameter_values(self.estimate.z), coefficients))
-        values, last = fixed
-        parts = [states, values, self.rows.inputs[:n], self.rows.times[:n, None], last]
-        return np.asarray(jax.vmap(function)(jnp.asarray(np.concatenate(parts, axis=1))))
+    def along(self, what: Callable[[Any, Any], Any], states: Float[np.ndarray, "row state"]) -> np.ndarray:
+        """Something that the augmented simulation has at phase points of the leading rows."""
+        e = self.estimate
+        return along(self.stepper.problem, what, self.recording, e.z, e.combination, states)
 
     @cached_property
     def innovations(self) -> Float[np.ndarray, "fitted channel"]:
@@ -137,15 +132,15 @@ class Outlook:
 
     def missing_force(self) -> Float[np.ndarray, "fitted coordinate"]:
         """Smoothed missing force on every momentum, in units of dp/dt, by fitted row (the last span's twice)."""
-        d, n = self.stepper.problem.equations.dim, self.rows.fitted
-        xi = np.asarray(self.smoothed.disturbances[: n - 1, d:])
+        n = self.rows.fitted
+        xi = np.asarray(self.smoothed.disturbances[: n - 1, self.stepper.problem.equations.momentum])
         force = xi / np.diff(self.rows.times[:n])[:, None]
         return np.concatenate([force, force[-1:]])
 
     def strain(self) -> Float[np.ndarray, "fitted coordinate"]:
         """Standardised smoothed disturbances of every momentum."""
-        d, n = self.stepper.problem.equations.dim, self.rows.fitted
-        series = np.asarray(self.smoothed.standardised_disturbances[: n - 1, d:])
+        n = self.rows.fitted
+        series = np.asarray(self.smoothed.standardised_disturbances[: n - 1, self.stepper.problem.equations.momentum])
         return np.concatenate([series, series[-1:]])
 
     def _run(self, x: np.ndarray, start: int) -> Any:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._trajectory import Course, model_at
+from ._trajectory import Course, effect_coefficients, model_at
 
 
 class Linear(NamedTuple):
@@ -45,7 +45,7 @@ def linearise(equations, integrator, course: Course, path, calibrated, slots, on
     f = calibrated.shape[0]
 
     def flow_and_read(x, theta, k):
-        flow, read = model_at(equations, integrator, course, theta[:f], theta[f:] @ onehot)
+        flow, read = model_at(equations, integrator, course, theta[:f], effect_coefficients(theta[f:], onehot))
         span = jax.tree.map(lambda leaf: leaf[k], course.spans)
         return flow(x, span), read(x, (course.times[k], course.inputs[k]))
 
@@ -63,9 +63,10 @@ def linearise(equations, integrator, course: Course, path, calibrated, slots, on
 
 
 def _diffusion(A: Array, intensity: Array, length: Array) -> Array:
-    """Covariance a white force adds over one span, by Simpson's rule over the time it acts. State (2d, 2d)."""
-    d = intensity.shape[0]
-    start = jnp.concatenate([jnp.zeros((d, d)), jnp.diag(jnp.sqrt(intensity))])
+    """Covariance a white force adds over one span, by Simpson's rule over the time it acts. Of the phase point."""
+    d, state = intensity.shape[0], A.shape[0]
+    momentum = state // 2 + jnp.arange(d)  # an unseen oscillator's, which follows, gets no force
+    start = jnp.zeros((state, d)).at[momentum, jnp.arange(d)].set(jnp.sqrt(intensity))
     end, middle = A @ start, 0.5 * (start + A @ start)
     return length / 6 * (end @ end.T + 4 * middle @ middle.T + start @ start.T)
 

@@ -5,15 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._effects import prices
+from .._effects import IMPULSE, prices
+from ._found import Found
 from ._problem import Combination, Problem
-from ._search import Found
 from ._weighed import Estimate
 
 # A coefficient whose posterior is as wide as this share of its prior has learnt nothing from the recording.
 _UNINFORMED = 0.7
 # Nats that an estimate which did not converge must be ahead to be reported nevertheless.
 _UNCONVERGED = 3.0
+# The simulation counts as consistent unless the probability of nothing left out is below this (contract).
+CONSISTENT = 0.05
 # Kinds of remainder other than white noise; each combination divides its remainder's prior among them.
 _REMAINDERS = ("coloured", "force")
 
@@ -49,8 +51,11 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     """Weigh every combination by evidence and the contract's prior (section 4)."""
     candidates = [problem.equations.candidates[i] for i in problem.searched]
     families = sorted({c.effect.family for c in candidates} | {"any"})
-    price = {problem.searched[i]: p for i, p in prices(candidates, families).items()}
     remainder = 1.0 / len(families)
+    whole = {problem.searched[i]: p for i, p in prices(candidates, families).items()}
+    price = {m: _share(problem, m) * whole[problem.whole(m)] for c in found.estimates for m in c
+             if m not in found.choices}  # fmt: skip
+    price |= {m: remainder * float(np.exp(-choices)) for m, choices in found.choices.items()}
     factor = 1.0 / max(1.0, inflation)
     top = max(e.log_evidence for es in found.estimates.values() for e in es)
     if not np.isfinite(top):
@@ -100,7 +105,19 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
     posterior is its prior; weighing it would only dilute the others.
     """
     best = max(found.estimates[combination], key=lambda e: e.log_evidence)
-    first = problem.head + problem.calibrated.size
-    sd = np.sqrt(np.diag(best.covariance)[first : first + len(combination)])
-    known = sd < _UNINFORMED * found.priors.scales[list(combination)]
-    return bool(np.isfinite(best.log_evidence) and known.all())
+    sd = np.sqrt(np.diag(best.covariance))
+    known = True
+    for member, place in problem.placed(combination):
+        one = problem.candidate(member)
+        amplitudes = slice(place.start, place.start + one.effect.amplitudes)
+        scales = found.priors.scales[one.first : one.first + one.effect.amplitudes]
+        known &= bool((sd[amplitudes] < _UNINFORMED * scales).all())
+    return bool(np.isfinite(best.log_evidence) and known)
+
+
+def _share(problem: Problem, member: int) -> float:
+    """Of an effect and target's prior, half goes to all recordings and the rest to the choices among them."""
+    variants = len(problem.variants(member))
+    if problem.candidate(member).effect is IMPULSE:
+        return 1.0 / len(problem.rows)
+    return 1.0 if variants == 0 else (0.5 if member == problem.whole(member) else 0.5 / variants)

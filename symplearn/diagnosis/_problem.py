@@ -1,11 +1,12 @@
 """What is asked: recordings, the augmented simulation, what is calibrated and its priors.
 
 The unknowns of one combination of effects are one vector z = [x_0 of every recording, calibrated values, slots].
-A slot holds the coefficient of one effect of the combination; which effect is data, so that nothing is compiled anew.
+A slot holds one value of an effect of the combination; which effect is data, so that nothing is compiled anew.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -13,11 +14,22 @@ from jaxtyping import Bool, Float, Int
 import integrators as ig
 
 from .._augmented import Equations
+from .._effects import HIDDEN, NOISE, Candidate
 from .._rows import Rows
 
-SLOTS = 3  # effects in the largest combination
+MOST = 3  # effects in the largest combination
+SLOTS = 9  # values of the largest combination: three of three each
 
-Combination = tuple[int, ...]  # places in `Equations.candidates`, in increasing order
+# Numbers of members of a problem, in increasing order: effects on targets, in all recordings or in some.
+Combination = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Member:
+    """An effect on a target that may be left out, and the recordings (from 0) that it is in."""
+
+    candidate: Candidate
+    recordings: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -56,18 +68,19 @@ class Problem:
     equations: Equations
     integrator: ig.AbstractIntegrator
     rows: tuple[Rows, ...]
-    parameters: Float[np.ndarray, " parameter"]  # known ones, and starting values of the calibrated
-    terms: Float[np.ndarray, "recording candidate"]  # coefficients already in the simulation
+    parameters: Float[np.ndarray, "recording parameter"]  # known ones, and starting values of the calibrated
+    terms: Float[np.ndarray, "recording coefficient"]  # coefficients already in the simulation
     calibrated: Calibrated
     initial: InitialPrior
     noise: Float[np.ndarray, " channel"]  # sd of one original reading, nan where it is estimated
-    searched: tuple[int, ...]  # candidates that may be reported
+    searched: tuple[int, ...]  # members that may be reported and are in all recordings
     units: dict[str, str]
+    known_outliers: tuple[int, ...] = ()  # columns whose outliers the file knows of
 
     @property
     def state(self) -> int:
         """Dimension of the phase space."""
-        return 2 * self.equations.dim
+        return 2 * self.equations.width
 
     @property
     def channels(self) -> int:
@@ -79,28 +92,83 @@ class Problem:
         return self.state * len(self.rows)
 
     @property
+    def slots(self) -> int:
+        """Where the values of effects start in z."""
+        return self.head + self.calibrated.size
+
+    @property
     def size(self) -> int:
         """Length of z."""
-        return self.head + self.calibrated.size + SLOTS
+        return self.slots + SLOTS
+
+    @cached_property
+    def members(self) -> tuple[Member, ...]:
+        """Every effect on every target: in all recordings, and after those in some of them only."""
+        every = tuple(range(len(self.rows)))
+        some: list[tuple[int, ...]] = [(r,) for r in every] if len(every) > 1 else []
+        some += [every[:r] + every[r + 1 :] for r in every] if len(every) > 2 else []
+        candidates = self.equations.candidates
+        return tuple(Member(c, which) for which in (every, *some) for c in candidates)
+
+    def variants(self, member: int) -> list[int]:
+        """The same effect and target in some of the recordings only."""
+        number = len(self.equations.candidates)
+        return list(range(member % number + number, len(self.members), number))
+
+    def whole(self, member: int) -> int:
+        """The same effect and target in all recordings."""
+        return member % len(self.equations.candidates)
+
+    def candidate(self, member: int) -> Candidate:
+        return self.members[member].candidate
+
+    def placed(self, combination: Sequence[int]) -> list[tuple[int, slice]]:
+        """Members with where their values stand in z."""
+        out, first = [], self.slots
+        for member in combination:
+            out.append((member, slice(first, first + self.candidate(member).effect.size)))
+            first += self.candidate(member).effect.size
+        return out
+
+    def is_possible(self, combination: Sequence[int]) -> bool:
+        """Whether a combination can be simulated: each effect and target once, at most one unseen oscillator."""
+        whole = {self.whole(member) for member in combination}
+        hidden = sum(self.candidate(member).effect is HIDDEN for member in combination)
+        return len(whole) == len(combination) <= MOST and hidden <= 1
 
     def local(self, recording: int) -> Int[np.ndarray, " local"]:
         """Which entries of z one recording depends on."""
         own = np.arange(recording * self.state, (recording + 1) * self.state)
         return np.concatenate([own, np.arange(self.head, self.size)])
 
-    def onehot(self, combination: Sequence[int]) -> Float[np.ndarray, "slot candidate"]:
-        """Which coefficient each slot is."""
-        matrix = np.zeros((SLOTS, len(self.equations.candidates)))
-        for slot, candidate in enumerate(combination):
-            matrix[slot, candidate] = 1.0
+    def onehot(self, combination: Sequence[int], recording: int) -> Float[np.ndarray, "row coefficient"]:
+        """Which coefficient each slot is in a recording; the last row switches on what has no amplitude for it."""
+        matrix = np.zeros((SLOTS + 1, self.equations.size))
+        for member, place in self.placed(combination):
+            if recording in self.members[member].recordings:
+                one = self.candidate(member)
+                rows = np.arange(place.start, place.stop) - self.slots
+                matrix[rows, np.arange(one.values.start, one.values.stop)] = 1.0
+                if one.effect.switched:
+                    matrix[-1, one.values.stop] = 1.0
         return matrix
 
     def active(self, combination: Sequence[int]) -> Bool[np.ndarray, " z"]:
         """Which entries of z are free under a combination."""
-        free = np.ones(self.size, bool)
+        free = np.zeros(self.size, bool)
         free[: self.head] = np.tile(self.initial.sd > 0, len(self.rows))
-        free[self.head + self.calibrated.size + len(combination) :] = False
+        free[self.head : self.slots] = True
+        for member, place in self.placed(combination):
+            free[place] = True
+            if self.candidate(member).effect is HIDDEN:
+                for r in self.members[member].recordings:
+                    free[self.unseen(r)] = True
         return free
+
+    def unseen(self, recording: int) -> Int[np.ndarray, "2"]:
+        """Where the unseen coordinate and its momentum at the first row stand in z."""
+        width = self.equations.width
+        return recording * self.state + np.array([width - 1, 2 * width - 1])
 
     def coefficients(self, recording: int, z: Float[np.ndarray, " z"], combination: Sequence[int]) -> np.ndarray:
         """The coefficient vector that one recording is stepped with."""
@@ -108,18 +176,31 @@ class Problem:
         values = self.terms[recording].copy()
         for j in range(c.parameters, c.size):
             values[c.place[j]] += c.recordings[recording, j] * z[self.head + j]
-        for slot, candidate in enumerate(combination):
-            values[candidate] += z[self.head + c.size + slot]
-        return values
+        return values + np.append(z[self.slots :], 1.0) @ self.onehot(combination, recording)
 
-    def parameter_values(self, z: Float[np.ndarray, " z"]) -> Float[np.ndarray, " parameter"]:
+    def parameter_values(self, recording: int, z: Float[np.ndarray, " z"]) -> Float[np.ndarray, " parameter"]:
         """The parameter vector with its calibrated entries filled in."""
-        c, values = self.calibrated, self.parameters.copy()
+        c, values = self.calibrated, self.parameters[recording].copy()
         values[c.place[: c.parameters]] = z[self.head : self.head + c.parameters]
         return values
 
+    def without(self, flagged: Sequence[Bool[np.ndarray, "_ channel"]]) -> "Problem":
+        """The same with some readings left out, by recording."""
+        rows = tuple(
+            replace(r, readings=np.where(bad, np.nan, r.readings), counts=np.where(bad, 0.0, r.counts))
+            for r, bad in zip(self.rows, flagged, strict=True)
+        )
+        return replace(self, rows=rows)
+
+    def noise_of(self, combination: Sequence[int]) -> Float[np.ndarray, " channel"]:
+        """Noise that a combination takes as known, NaN where it is estimated."""
+        noise = self.noise.copy()
+        for member in combination:
+            if self.candidate(member).effect is NOISE:
+                noise[self.candidate(member).place] = np.nan
+        return noise
+
     def lower_bounds(self, combination: Sequence[int]) -> dict[int, float]:
         """Entries of z that are physical above a bound only: a drag adds up to at least nothing with its known term."""
-        first = self.head + self.calibrated.size
-        signed = [(s, c) for s, c in enumerate(combination) if self.equations.candidates[c].effect.positive]
-        return {first + slot: -float(self.terms[:, c].min()) for slot, c in signed}
+        signed = [(m, place) for m, place in self.placed(combination) if self.candidate(m).effect.positive]
+        return {place.start: -float(self.terms[:, self.candidate(m).first].min()) for m, place in signed}

@@ -2,250 +2,291 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import combinations
+from dataclasses import replace
 
 import numpy as np
 
-from ._calibrate import Priors, grow
+from .._effects import OUTLIERS, Candidate
+from ._calibrate import Fits, estimate_noise, residuals, weights
+from ._effect_priors import motion_along, with_effects, with_unnamed
+from ._found import Found
 from ._noisy import PathFit, fit_paths
-from ._problem import SLOTS, Combination
-from ._start import priors_without_effects, scales, typical_forces, windows, with_states
-from ._stochastic import run_filter
+from ._null_paths import beside, null_paths
+from ._problem import MOST, Combination, Problem
+from ._scan import Start, Unit, grid, on_path, on_trajectory, scan, spacing
+from ._start import priors_without_effects, with_states
 from ._trajectory import Stepper
-from ._weighed import Estimate, weigh_coloured, weigh_white
+from ._unnamed import Proposal
+from ._weigher import KEPT, Weigher
 
-# A window grows in these steps, so that a trajectory fit is not caught in a local minimum.
-_GROWTH = (0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.0)
-# Intensities of the missing force that are tried, as shares of the forces already there.
-_SHARES = np.geomspace(3e-5, 0.3, 8)
 # Combinations of one size are carried on to the next size while within this many nats of the best.
 _REACH = 30.0
-_KEPT = 8
-# Substeps over all rows beyond which the search is narrowed before the whole recording is used.
-_AFFORDABLE = 12_000
-
-
-@dataclass
-class Found:
-    """Everything that was weighed: estimates by combination, one per kind of remainder."""
-
-    priors: Priors
-    estimates: dict[Combination, list[Estimate]] = field(default_factory=dict)
-    complete: bool = True
-
-    def add(self, estimate: Estimate) -> None:
-        """Keep the better of two estimates of the same combination and kind."""
-        kinds = self.estimates.setdefault(estimate.combination, [])
-        same = [e for e in kinds if e.kind == estimate.kind]
-        if not same:
-            kinds.append(estimate)
-        elif estimate.log_evidence > same[0].log_evidence:
-            kinds[kinds.index(same[0])] = estimate
-
-    def of(self, combination: Combination, kind: str) -> Estimate | None:
-        """The estimate of a combination under one kind of remainder, None where there is none."""
-        return next((e for e in self.estimates.get(combination, []) if e.kind == kind), None)
-
-    def best(self, combination: Combination) -> float:
-        """The largest log evidence of a combination over kinds."""
-        return max((e.log_evidence for e in self.estimates[combination]), default=-np.inf)
+# Combinations that are extended, most larger ones that are fitted, and what a larger one must gain to go on.
+_BASES, _PAIRS, _WORTH = 5, 40, 2.0
+# Combinations that are fitted between two looks at the clock.
+_BATCH = 24
+# Combinations whose places are moved, how near they are to the best; and those that are weighed again in finer steps.
+_MOVED, _NEAR, _AGAIN = 3, 8.0, 24
+# Places at which an effect is tried beside nothing, and beside others; fewer where a trajectory costs more than one
+# of so many leapfrog substeps, and how much more a substep of a nonseparable system costs.
+_MANY, _FEW, _LEAST = 160, 60, 10
+_CHEAP, _NONSEPARABLE = 600, 5
+_ONE_MORE = {1: "one effect", 2: "a second effect", 3: "a third effect"}
 
 
 class Search:
     """Finds which combinations of effects explain the recordings of a problem, and with what evidence."""
 
-    def __init__(self, stepper: Stepper, seeds: np.ndarray, deadline: float, progress: Callable[[str], None]):
-        self.problem, self.stepper, self.seeds, self.seed = stepper.problem, stepper, seeds, seeds[0]
-        self.rows = [r.fitted for r in self.problem.rows]
+    def __init__(self, stepper: Stepper, seed: np.ndarray, deadline: float, progress: Callable[[str], None]):
+        self.weigher = Weigher(stepper, Found(stepper.problem, priors_without_effects(stepper.problem)))
+        self.seed, self.rows = seed, self.weigher.rows
         self.deadline, self.progress = deadline, progress
+
+    @property
+    def found(self) -> Found:
+        return self.weigher.found
+
+    @property
+    def stepper(self) -> Stepper:
+        return self.weigher.stepper
+
+    @property
+    def problem(self) -> Problem:
+        return self.weigher.problem
+
+    @property
+    def base(self) -> Combination:
+        return self.weigher.base
 
     def run(self) -> Found:
         """Search, smallest combinations first."""
-        bare = priors_without_effects(self.problem)
-        self.found = Found(bare)
-        self.progress("following the recording with a missing force")
-        self.null_paths = self._null_paths(bare)
-        best = max(self.null_paths, key=lambda fit: fit.log_evidence)
-        self.typical = typical_forces(self.problem, best.z, best.paths)
-        wide = with_states(self.problem, bare, best.paths)
-        self.found.priors = replace(wide, scales=scales(self.problem, best.z, best.paths))
-        self._add_paths(fit_paths(self.stepper, self.null_paths, self.found.priors, self.rows, 3))
-        for size in range(1, SLOTS + 1):
-            candidates = self._proposals(size)
-            # The simulation as it is and single effects are weighed however little time is given.
-            if not candidates or (size > 1 and not self._in_time()):
+        self._begin()
+        for size in range(1, MOST - len(self.base) + 1):
+            if size > 1 and not self._in_time():
                 break
-            single = f"the simulation as it is and {len(candidates) - 1} single effects"
-            self.progress(f"weighing {single if size == 1 else f'{len(candidates)} combinations of {size} effects'}")
-            self._weigh(candidates)
-            self._exchange(size)
-            if size > 1 and self._long and not self._gained(size):
+            self.progress(f"looking where {_ONE_MORE[size]} would help")
+            starts = self._proposals(size)
+            if not starts:
                 break
+            number = len({start.combination for start in starts})
+            self.progress(f"weighing {number} {'single effects' if size == 1 else f'combinations of {size} effects'}")
+            # The first single effects are weighed however little time is given.
+            for a in range(0, len(starts), _BATCH):
+                if (size == 1 and a == 0) or self._in_time():
+                    self.weigher.weigh(starts[a : a + _BATCH])
+            if size > 1 and not self._gained(size):
+                break
+        self._move_places()
         self._weigh_subsets()
         self.progress("weighing missing forces beside the best combinations")
         self._weigh_forces()
+        self.weigher.weigh_with_outliers_in()
         return self.found
+
+    def _begin(self) -> None:
+        """The simulation without effects, under every remainder; and what every effect's prior is, from its motion."""
+        bare, w = self.found.priors, self.weigher
+        self.progress("following the recording with a missing force")
+        self.null_paths = null_paths(w.stepper, self.seed, self.rows, bare, w.path_steps)
+        for _ in range(2):
+            if not w.take_out_outliers(self._null):
+                break
+            self.null_paths = null_paths(w.stepper, self.seed, self.rows, bare, w.path_steps)
+        self.null_paths = [replace(fit, combination=self.base) for fit in self.null_paths]
+        best = self._null
+        motion = motion_along(self.problem, best.z, best.paths)
+        self.typical = motion.forces
+        w.found.priors = with_effects(self.problem, with_states(self.problem, bare, best.paths), motion)
+        self.progress("weighing the simulation as it is")
+        w.weigh([Start(self.base, self._from_seed(), 0.0)])
+        w.add_paths(fit_paths(w.stepper, self.null_paths, w.found.priors, self.rows, 3))
+
+    @property
+    def _null(self) -> PathFit:
+        """The best path of the simulation without effects."""
+        return max(self.null_paths, key=lambda fit: fit.log_evidence)
+
+    def again(self, stepper: Stepper) -> Found:
+        """Fit and weigh the best combinations anew with another stepper of the same recordings."""
+        w, before = self.weigher, self.found
+        kept = sorted(before.estimates, key=before.best, reverse=True)[:_AGAIN]
+        w.moved_to(stepper, Found(stepper.problem, before.priors, complete=before.complete))
+        mine = [c for c in dict.fromkeys([self.base, *kept]) if set(self.base) <= set(c)]
+        w.weigh([Start(c, white.z, 0.0) for c in mine if (white := before.of(c, "white"))], whole=True)
+        w.add_paths(fit_paths(w.stepper, self.null_paths, w.found.priors, self.rows, 3))
+        self._weigh_forces()
+        w.weigh_with_outliers_in()
+        return self.found
+
+    def with_unnamed(self, stepper: Stepper, listed: Sequence[Proposal]) -> Found:
+        """Weigh forces without a name, which the problem of `stepper` has beside everything that was found before."""
+        w, before = self.weigher, self.found
+        old, new = len(self.problem.equations.candidates), len(stepper.problem.equations.candidates)
+
+        def renumbered(combination: Combination) -> Combination:
+            return tuple(m // old * new + m % old for m in combination)
+
+        members = list(range(new - len(listed), new))
+        priors = with_unnamed(stepper.problem, before.priors, listed, members, self.typical)
+        choices = {m: one.choices for m, one in zip(members, listed, strict=True)}
+        kept = {
+            renumbered(c): [replace(e, combination=renumbered(c)) for e in es] for c, es in before.estimates.items()
+        }
+        w.moved_to(stepper, Found(stepper.problem, priors, kept, before.complete, choices))
+        w.owed = {renumbered(c): value for c, value in w.owed.items()}
+        w.base = renumbered(w.base)
+        combination, z = tuple(sorted((*self.base, *members))), self._from_seed()
+        for member, place in self.problem.placed(combination):
+            if member in members:
+                z[place] = listed[members.index(member)].sizes
+        w.weigh([Start(combination, z, 0.0)])
+        self._add_forces([combination], 1)
+        return self.found
+
+    def _move_places(self) -> None:
+        """Try the best combinations with their times, thresholds and frequencies moved by steps of the grid."""
+        ranked = sorted(self.found.estimates, key=self.found.best, reverse=True)
+        top = self.found.best(ranked[0])
+        starts = []
+        for c in [c for c in ranked if self.found.best(c) > top - _NEAR][:_MOVED] if self._in_time() else []:
+            white = self.found.of(c, "white")
+            for member, place in self.problem.placed(c):
+                if white is not None and self.problem.candidate(member).effect.places:
+                    starts += [Start(c, z, 0.0) for z in self._moved(white.z, member, place.stop - 1)]
+        if starts:
+            self.progress("moving times, thresholds and frequencies")
+            self.weigher.weigh(starts, whole=True)
+
+    def _moved(self, z: np.ndarray, member: int, entry: int) -> list[np.ndarray]:
+        one, priors = self.problem.candidate(member), self.found.priors
+        low, high = priors.lower[one.values.stop - 1], priors.upper[one.values.stop - 1]
+        step = spacing(one, low, high)
+        out = []
+        for k in (-4, -3, -2, -1, 1, 2, 3, 4):
+            if low < z[entry] + k * step < high:
+                out.append(z.copy())
+                out[-1][entry] += k * step
+        return out
+
+    def _size(self, combination: Combination) -> int:
+        """Effects beside outliers that are taken out."""
+        return len(combination) - len(self.base)
+
+    def _from_seed(self) -> np.ndarray:
+        start = self.seed.copy()
+        start[self.problem.slots :] = 0.0
+        return start
 
     def _in_time(self) -> bool:
         if time.monotonic() > self.deadline:
             self.found.complete = False
         return self.found.complete
 
-    def _windows(self) -> list[list[int]]:
-        return windows(self.rows, _GROWTH, max(8, 4 * self.problem.state))
-
-    def _null_paths(self, priors: Priors) -> list[PathFit]:
-        """The simulation without effects under missing forces of several intensities."""
-        problem = self.problem
-        guess = self._rough_noise()
-        first = [self._filtered_path(r, self.seed, guess) for r in range(len(self.rows))]
-        self.typical = typical_forces(problem, self.seed, first)
-        starts = [PathFit((), self._intensity(share), self.seed, guess, first) for share in _SHARES]
-        return fit_paths(self.stepper, starts, priors, self.rows, self._path_steps)
-
-    def _intensity(self, share: float) -> np.ndarray:
-        """Squared force times the time over which it would be felt: a tenth of the shortest recording's length."""
-        length = min(r.times[n - 1] - r.times[0] for r, n in zip(self.problem.rows, self.rows, strict=True))
-        return (share * np.maximum(self.typical, 1e-300)) ** 2 * length / 10
-
-    def _rough_noise(self) -> np.ndarray:
-        """Reading noise from third differences, which a smooth motion hardly has."""
-        out = []
-        for j, known in enumerate(self.problem.noise):
-            columns = [r.readings[:n, j] for r, n in zip(self.problem.rows, self.rows, strict=True)]
-            joined = np.concatenate([np.diff(column, 3) ** 2 / 20 for column in columns])
-            spread = np.nanstd(np.concatenate(columns))
-            rough = np.sqrt(np.nanmedian(joined) / 0.455) if np.isfinite(joined).any() else spread
-            count = max(1.0, float(np.median(self.problem.rows[0].counts[:, j])))
-            out.append(known if np.isfinite(known) else max(rough, 1e-6 * spread) * np.sqrt(count))
-        return np.array(out)
-
-    def _filtered_path(self, r: int, z: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """A path near the readings: filtered with a strong missing force, from a wide initial state."""
-        problem, course = self.problem, self.stepper.courses[r]
-        x = z[r * problem.state : (r + 1) * problem.state]
-        spread = np.diag(np.maximum(0.05 * np.abs(x), 1e-3 * np.abs(x).max() + 1e-12) ** 2)
-        spread[problem.initial.sd == 0] = 0.0
-        force = typical_forces(problem, z, [np.tile(x, (1, 1))] * len(self.rows))
-        span = float(np.median(np.diff(problem.rows[r].times)))
-        intensity = np.maximum(force, np.abs(force).max() * 1e-3) ** 2 * span * 10
-        _, filtered = run_filter(problem, course, r, z, (), noise, 0 * noise, intensity, spread, self.rows[r])
-        means = np.array(filtered.filtered_means[: self.rows[r]])
-        means[0] = x
-        return means if bool(filtered.ok) else np.tile(x, (self.rows[r], 1))
-
-    def _proposals(self, size: int) -> list[Combination]:
-        """Combinations of one size: every single effect, then what extends the best of the size below."""
-        searched = self.problem.searched
+    def _proposals(self, size: int) -> list[Start]:
+        """Where fits of combinations of one size begin: each of the best of the size below with one effect more."""
         if size == 1:
-            return [(), *((c,) for c in searched)]
-        if size == 2 and len(searched) <= 12:
-            return list(combinations(searched, 2))
-        known = [c for c in self.found.estimates if len(c) == size - 1 and c]
-        top = max((self.found.best(c) for c in known), default=-np.inf)
-        ranked = sorted(known, key=self.found.best, reverse=True)
-        kept = [c for c in ranked if self.found.best(c) > top - _REACH][:_KEPT] or ranked[:_KEPT]
-        if size == 2:
-            kept = ranked[:_KEPT]
-        more = {tuple(sorted((*c, one))) for c in kept for one in searched if one not in c}
-        return sorted(more)
+            return self._singles()
+        best = [c for c in self.found.estimates if self._size(c) == size - 1]
+        best = sorted(best, key=self.found.best, reverse=True)
+        top = self.found.best(best[0]) if best else -np.inf
+        listed: list[Start] = []
+        for c in [c for c in best if self.found.best(c) > top - _REACH][:_BASES]:
+            white = self.found.of(c, "white")
+            assert white is not None  # every combination is weighed under white noise first
+            mine = self._scanned(c, white.z, _FEW)
+            listed += [replace(start, gain=start.gain + self.found.best(c)) for start in mine]
+        listed.sort(key=lambda start: -start.gain)
+        kept: dict[tuple[Combination, int], Start] = {}
+        for start in listed:
+            tried = sum(combination == start.combination for combination, _ in kept)
+            if tried < 2 and len(kept) < _PAIRS and start.combination not in self.found.estimates:
+                kept[start.combination, tried] = start
+        return list(kept.values())
 
-    def _exchange(self, size: int) -> None:
-        """Exchange single members of the best combinations of one size, so that no rival is missed."""
-        if size == 1 or self._long or not self._in_time():
-            return
-        mine = sorted((c for c in self.found.estimates if len(c) == size), key=self.found.best, reverse=True)
-        swapped = {
-            tuple(sorted((*c[:k], *c[k + 1 :], one)))
-            for c in mine[: _KEPT // 2]
-            for k in range(size)
-            for one in self.problem.searched
-            if one not in c
-        }
-        missing = sorted(swapped - set(self.found.estimates))
-        if missing:
-            self.progress(f"exchanging members: {len(missing)} more combinations of {size} effects")
-            self._weigh(missing)
+    def _singles(self) -> list[Start]:
+        """Every effect that has no place from zero, in a growing window; the others from where they promise most."""
+        problem, zero = self.problem, self._from_seed()
+        plain = [c for c in problem.searched if not problem.candidate(c).effect.places]
+        starts = [Start(self._with(c), zero, 0.0) for c in plain if problem.candidate(c).effect is not OUTLIERS]
+        white = self.found.of(self.base, "white")
+        assert white is not None
+        found = self._scanned(self.base, white.z, _MANY)
+        best = self._null
+        if np.isfinite(best.log_evidence):
+            found += scan(problem, on_path(self.stepper, best, self.rows), best.z, self.base, self.found.priors,
+                          self._units(_FEW))  # fmt: skip
+        top = max((start.gain for start in found), default=0.0)
+        placed = [s for s in found if self._new(s).effect.places and s.gain > top - _REACH]
+        part = [s for s in found if not self._new(s).effect.places and s.gain > top - _REACH
+                and not set(s.combination) <= {*problem.searched, *self.base}]  # fmt: skip
+        return starts + placed + sorted(part, key=lambda s: -s.gain)[:_PAIRS]
+
+    def _with(self, member: int) -> Combination:
+        return tuple(sorted((*self.base, member)))
+
+    def _new(self, start: Start) -> Candidate:
+        """The effect of a single one's start."""
+        (member,) = set(start.combination) - set(self.base)
+        return self.problem.candidate(member)
+
+    def _units(self, most: int) -> list[Unit]:
+        """What is tried: every effect and target at every place, evenly thinned to at most so many places."""
+        out: list[Unit] = []
+        substeps = sum(self.rows) * self.problem.rows[0].spans.inputs.shape[1]
+        load = substeps * (1 if self.problem.equations.separable else _NONSEPARABLE) / _CHEAP
+        most = max(_LEAST, int(most / max(1.0, load)))
+        for c in self.problem.searched:
+            units = grid(self.problem, self.found.priors, c)
+            out += units[:: max(1, -(-len(units) // most))]
+        return out
+
+    def _scanned(self, combination: Combination, z: np.ndarray, most: int) -> list[Start]:
+        """Starts with one effect more than a fitted combination."""
+        predictions = self.stepper.predict(z[None], [combination], self.rows)
+        weight = weights(self.problem, self.rows)
+        noise = estimate_noise(self.problem, [combination], residuals(self.problem, predictions, weight), weight)
+        fits = Fits([combination], z[None], noise, predictions, np.zeros(1), np.ones(1, bool))
+        if not np.isfinite(noise).all():
+            return []
+        grams = on_trajectory(self.stepper, fits, 0, self.rows)
+        return scan(self.problem, grams, z, combination, self.found.priors, self._units(most))
 
     def _gained(self, size: int) -> bool:
         """Whether the best of this size beats the best of smaller ones, so that a larger one may be worth it."""
-        smaller = max(self.found.best(c) for c in self.found.estimates if len(c) < size)
-        return max(self.found.best(c) for c in self.found.estimates if len(c) == size) > smaller
-
-    def _weigh(self, candidates: Sequence[Combination]) -> None:
-        """Fit and weigh combinations; on a long recording most are dropped after its first part."""
-        start = np.tile(self.seed, (len(candidates), 1))
-        start[:, self.problem.head + self.problem.calibrated.size :] = 0.0
-        growing = self._windows()
-        cut = self._first_part(growing)
-        if cut < len(growing) and len(candidates) > _KEPT:
-            fits = grow(self.stepper, start, candidates, self.found.priors, growing[:cut], final=20)
-            values = [e.log_evidence for e in weigh_white(self.problem, fits, self.found.priors, growing[cut - 1])]
-            order = [int(k) for k in np.argsort(values)[::-1]]
-            kept = sorted(order[:_KEPT], key=lambda k: -values[k]) + [k for k in order[_KEPT:] if not candidates[k]]
-            start, candidates, growing = fits.z[kept], [candidates[k] for k in kept], growing[cut:]
-        fits = grow(self.stepper, start, candidates, self.found.priors, growing)
-        for estimate in weigh_white(self.problem, fits, self.found.priors, self.rows):
-            self.found.add(estimate)
-        for estimate in weigh_coloured(self.problem, fits, self.found.priors, self.rows):
-            self.found.add(estimate)
-
-    @property
-    def _long(self) -> bool:
-        """Whether the recordings are too long for every combination to see all of them."""
-        return self._first_part(self._windows()) < len(_GROWTH)
-
-    @property
-    def _path_steps(self) -> int:
-        return 8 if self._long else 16
-
-    def _first_part(self, growing: list[list[int]]) -> int:
-        """How many of the growing windows are affordable for every combination."""
-        pieces = self.problem.rows[0].spans.inputs.shape[1]
-        return max(1, sum(sum(rows) * pieces <= _AFFORDABLE for rows in growing))
+        smaller = max(self.found.best(c) for c in self.found.estimates if self._size(c) < size)
+        mine = [self.found.best(c) for c in self.found.estimates if self._size(c) == size]
+        return max(mine, default=-np.inf) > smaller + _WORTH
 
     def _weigh_subsets(self) -> None:
         """What the best combinations become without each of their members, where that was not weighed yet."""
-        ranked = sorted((c for c in self.found.estimates if c), key=self.found.best, reverse=True)[:_KEPT]
-        less = dict.fromkeys(c[:k] + c[k + 1 :] for c in ranked for k in range(len(c)))
+        ranked = sorted((c for c in self.found.estimates if c), key=self.found.best, reverse=True)[:KEPT]
+        less = dict.fromkeys(c[:k] + c[k + 1 :] for c in ranked for k in range(len(c)) if c[k] not in self.base)
         missing = [c for c in less if c and c not in self.found.estimates]
         if missing:
-            self._weigh(missing[:_KEPT])
+            self.weigher.weigh([Start(c, self._shrunk(c, ranked), 0.0) for c in missing[:KEPT]], whole=True)
+
+    def _shrunk(self, combination: Combination, ranked: Sequence[Combination]) -> np.ndarray:
+        """Where a combination begins that lacks one member of a fitted one: at that one's values."""
+        larger = next(c for c in ranked if set(combination) < set(c))
+        white = self.found.of(larger, "white")
+        assert white is not None
+        z, where = white.z.copy(), dict(self.problem.placed(larger))
+        z[self.problem.slots :] = 0.0
+        for member, place in self.problem.placed(combination):
+            z[place] = white.z[where[member]]
+        return z
 
     def _weigh_forces(self) -> None:
         """Best combinations again, each with a missing force beside it."""
-        named = [c for c in self.found.estimates if c]
-        contenders = sorted(named, key=self.found.best, reverse=True)[: _KEPT // 2 if self._long else _KEPT]
-        null = max(self.null_paths, key=lambda fit: fit.log_evidence)
+        named = sorted((c for c in self.found.estimates if self._size(c)), key=self.found.best, reverse=True)
+        long = self.weigher.is_long
+        self._add_forces(named[: KEPT // 2 if long else KEPT], 2 if long else 1)
+
+    def _add_forces(self, combinations: Sequence[Combination], every: int) -> None:
         starts = []
-        for c in contenders:
+        for c in combinations:
             white = self.found.of(c, "white")
             assert white is not None  # every combination is weighed under white noise first
-            for share in _SHARES[: -1 : 2 if self._long else 1]:
-                starts.append(PathFit(c, self._intensity(share), white.z, null.noise, null.paths))
-        self._add_paths(fit_paths(self.stepper, starts, self.found.priors, self.rows, self._path_steps))
-
-    def _add_paths(self, fits: Sequence[PathFit]) -> None:
-        """Of the intensities tried for each combination, the best, owing for the choice."""
-        for combination in dict.fromkeys(fit.combination for fit in fits):
-            mine = [fit for fit in fits if fit.combination == combination]
-            values = np.array([fit.log_evidence for fit in mine])
-            if not np.isfinite(values).any():
-                continue
-            best = mine[int(np.argmax(values))]
-            assert best.laplace is not None  # its evidence is finite
-            mean = values.max() + np.log(np.mean(np.exp(values - values.max())))
-            self.found.add(
-                Estimate(
-                    combination,
-                    "force",
-                    best.z,
-                    best.laplace.covariance,
-                    best.noise,
-                    float(mean),
-                    best.converged,
-                    intensity=best.intensity,
-                    paths=best.paths,
-                )  # fmt: skip
-            )
+            starts += beside(self._null, self.problem, self.rows, self.typical, c, white.z, every)
+        w = self.weigher
+        w.add_paths(fit_paths(w.stepper, starts, self.found.priors, self.rows, w.path_steps))

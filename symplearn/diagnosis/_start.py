@@ -1,21 +1,20 @@
-"""Where the fits begin: initial states found in a short window, substeps fine enough, scales of every effect."""
+"""Where the fits begin: initial states found in a short window, from many starts."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from .._effects import Drag, PowerForce
+from ._along import along_all, force
 from ._calibrate import Fits, Priors, calibrate, grow
+from ._effect_priors import rms
 from ._problem import Problem
 from ._trajectory import Stepper
 
 # Starts tried for the initial states, and the spread of the random ones.
 _STARTS = 16
 _SPREADS = (1e-3, 0.1, 1.0, 10.0)
-# Prior scale of an effect: its force against the forces already there, or its error against the reading's spread.
-STRENGTH = 0.3
 # Where nothing is known: this many times the size of what was found.
 _WIDE = 10.0
 
@@ -32,16 +31,18 @@ def priors_without_effects(problem: Problem) -> Priors:
         # A flat prior is a very wide one, so that no combination gains by losing sight of a parameter.
         wide = np.where(c.mean != 0, _WIDE * np.abs(c.mean), np.inf)
         mean[part], precision[part] = c.mean, np.where(np.isinf(c.sd), wide, c.sd) ** -2.0
-    return Priors(mean, precision, np.full(len(problem.equations.candidates), np.inf))
+    size = problem.equations.size
+    wide = np.full(size, np.inf)
+    return Priors(mean, precision, np.zeros(size), wide, -wide, wide, np.full(2, np.inf))
 
 
-def with_states(problem: Problem, priors: Priors, paths: Sequence[Float[np.ndarray, "time state"]]) -> Priors:
+def with_states(problem: Problem, priors: Priors, paths: Sequence[Float[np.ndarray, "_ state"]]) -> Priors:
     """Very wide priors of unknown initial states, as large as the motion along given paths asks for."""
     precision = priors.precision.copy()
-    size = np.array([_rms(column) for column in np.concatenate(paths).T])
+    size = np.array([rms(column) for column in np.concatenate(paths).T])
     unknown = np.tile(np.isinf(problem.initial.sd), len(problem.rows))
     precision[: problem.head][unknown] = (_WIDE * np.tile(size, len(problem.rows))[unknown]) ** -2.0
-    return Priors(priors.mean, precision, priors.scales)
+    return replace(priors, precision=precision)
 
 
 def windows(rows: Sequence[int], fractions: Sequence[float], least: int) -> list[list[int]]:
@@ -73,7 +74,7 @@ def _tightened(problem: Problem, priors: Priors) -> Priors:
     part = slice(problem.head, problem.head + problem.calibrated.size)
     scale = 1e-3 * np.maximum(np.abs(problem.calibrated.mean), 1e-6)
     precision[part] = np.maximum(precision[part], scale**-2.0)
-    return Priors(priors.mean, precision, priors.scales)
+    return replace(priors, precision=precision)
 
 
 def _likelihood(problem: Problem, fits: Fits, rows: Sequence[int]) -> np.ndarray:
@@ -82,44 +83,7 @@ def _likelihood(problem: Problem, fits: Fits, rows: Sequence[int]) -> np.ndarray
     return fits.cost + 2 * (number * np.log(fits.noise)).sum(1)
 
 
-def scales(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarray, "time state"]]) -> np.ndarray:
-    """Prior standard deviation of every coefficient: the same strength for every effect, along given paths."""
-    eq, d = problem.equations, problem.equations.dim
-    velocity, force, readings = (_along(problem, z, paths, f) for f in (eq.velocity, eq.slope, eq.readings))
-    q = np.concatenate([path[:, :d] for path in paths])
-    out = np.empty(len(eq.candidates))
-    for place, one in enumerate(eq.candidates):
-        i = one.place
-        if one.effect.family == "sensor":
-            spread = np.std(readings[:, i])
-            out[place] = STRENGTH * (spread if one.effect.name == "sensor_bias" else 1.0)
-            continue
-        power = one.effect.power if isinstance(one.effect, PowerForce | Drag) else 0
-        unit = np.abs(velocity[:, i] if isinstance(one.effect, Drag) else q[:, i]) ** power
-        out[place] = STRENGTH * _rms(force[:, i]) / max(_rms(unit), 1e-300)
-    return np.where(np.isfinite(out) & (out > 0), out, 1.0)
-
-
 def typical_forces(problem: Problem, z: np.ndarray, paths: Sequence[np.ndarray]) -> np.ndarray:
     """Root mean square of dp/dt along given paths, by momentum."""
-    force = _along(problem, z, paths, problem.equations.slope)
-    return np.array([_rms(column) for column in force.T])
-
-
-def _rms(values: np.ndarray) -> float:
-    """Root mean square of the finite values; 1 where there is none, or none but zeros."""
-    square = values[np.isfinite(values)] ** 2
-    mean = float(np.sqrt(square.mean())) if square.size else 1.0
-    return mean if np.isfinite(mean) and mean > 0 else 1.0
-
-
-def _along(problem: Problem, z: np.ndarray, paths: Sequence[np.ndarray], function) -> np.ndarray:
-    """One of the compiled equations along the paths of all recordings, without effects."""
-    rows = []
-    for r, path in enumerate(paths):
-        n = len(path)
-        fixed = np.broadcast_to(problem.parameter_values(z), (n, len(problem.parameters)))
-        terms = np.broadcast_to(problem.coefficients(r, z, ()), (n, problem.terms.shape[1]))
-        parts = [path, fixed, problem.rows[r].inputs[:n], problem.rows[r].times[:n, None], terms]
-        rows.append(np.asarray(jax.vmap(function)(np.concatenate(parts, axis=1))))
-    return np.concatenate(rows)
+    push = along_all(problem, force, z, paths)
+    return np.array([rms(column) for column in push[:, : problem.equations.dim].T])

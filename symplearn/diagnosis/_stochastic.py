@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 import integrators as ig
 
-from .._augmented import Span
+from .._augmented_flow import Span
 from .._filter import Filtered, unscented_filter
 from .._model import Gaussian, StateSpaceModel
 from .._smoother import Smoothed, smooth
@@ -24,12 +24,17 @@ class MissingForce(eqx.Module):
 
     intensity: Float[Array, " d"]  # squared force times time
     softness: Float[Array, " d"]
+    unseen: int = eqx.field(static=True, default=0)
 
     def covariance(self, span: Span) -> Float[Array, "state state"]:
         t = span.step * span.inputs.shape[-2]
         q, w = self.intensity, self.softness
-        cross = jnp.diag(0.5 * w * q * t**2)
-        return jnp.block([[jnp.diag(w**2 * q * t**3 / 3), cross], [cross, jnp.diag(q * t)]])
+        cross = self._filled(0.5 * w * q * t**2)
+        return jnp.block([[self._filled(w**2 * q * t**3 / 3), cross], [cross, self._filled(q * t)]])
+
+    def _filled(self, values: Array) -> Array:
+        """A diagonal, with nothing for an unseen oscillator."""
+        return jnp.diag(jnp.pad(values, (0, self.unseen)))
 
 
 class _RowNoise(eqx.Module):
@@ -59,7 +64,7 @@ def filter_lane(
     `noise` is that of one original reading; `roots` (time, channel) the root of each row's information in its units.
     """
     flow, read = model_at(equations, integrator, course, calibrated, coefficients)
-    force, initial = MissingForce(intensity, soft), Gaussian(x, spread)
+    force, initial = MissingForce(intensity, soft, int(equations.hidden)), Gaussian(x, spread)
     model = StateSpaceModel(flow, _Scaled(read), force, _RowNoise(noise**2), initial)
     n = readings.shape[0]
     spans = jax.tree.map(lambda leaf: leaf[: n - 1], course.spans)
@@ -95,8 +100,8 @@ def padded(values: Float[np.ndarray, "time ..."], length: int, fill: float) -> F
 def softness(problem: Problem, course: Course, z: np.ndarray, recording: int) -> np.ndarray:
     """d2H/dp_i2 at the initial phase point, by which a missing impulse becomes a missing velocity."""
     eq = problem.equations
-    x = z[recording * problem.state : (recording + 1) * problem.state]
-    rest = [problem.parameter_values(z), course.inputs[0], course.times[:1], np.zeros(len(eq.candidates))]
+    x = z[recording * problem.state : (recording + 1) * problem.state].reshape(2, -1)[:, : eq.dim].ravel()
+    rest = [problem.parameter_values(recording, z), course.inputs[0], course.times[:1], np.zeros(eq.size)]
     return np.asarray(eq.softness(jnp.concatenate([jnp.asarray(part, float) for part in (x, *rest)])))
 
 
@@ -117,14 +122,15 @@ def run_filter(
     Readings from row `seen` on are hidden; rows beyond the recording's own are padding.
     """
     length = course.times.shape[0]
-    onehot, head, f = problem.onehot(combination), problem.head, problem.calibrated.size
+    head, f = problem.head, problem.calibrated.size
+    found = problem.coefficients(recording, z, combination) - problem.coefficients(recording, z, ())
     readings = padded(problem.rows[recording].readings[:seen], length, np.nan)
     model, spans, contexts, filtered = _filter(
         problem.equations,
         problem.integrator,
         course,
         jnp.asarray(z[head : head + f]),
-        jnp.asarray(z[head + f :] @ onehot),
+        jnp.asarray(found),
         jnp.asarray(noise),
         jnp.asarray(intensity),
         jnp.asarray(softness(problem, course, z, recording)),

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,9 +14,11 @@ from jaxtyping import Array, Float
 
 import integrators as ig
 
-from .._augmented import Equations, SimulatedFlow, SimulatedReading, Span
-from ._problem import SLOTS, Combination, Problem
+from .._augmented import Equations
+from .._augmented_flow import SimulatedFlow, SimulatedReading, Span
+from ._problem import Combination, Problem
 
+DIRECTIONS = 6  # slopes are taken along a multiple of this many directions, so that few programs are compiled
 LANES = 8  # combinations stepped together; a fixed number, so that the answer does not depend on the cores
 
 
@@ -26,10 +29,10 @@ class Course(eqx.Module):
     times: Float[Array, " time"]
     inputs: Float[Array, "time input"]
     parameters: Float[Array, " parameter"]
-    terms: Float[Array, " candidate"]
+    terms: Float[Array, " coefficient"]
     # How calibrated values enter the parameters and the coefficients.
     to_parameters: Float[Array, "f parameter"]
-    to_coefficients: Float[Array, "f candidate"]
+    to_coefficients: Float[Array, "f coefficient"]
 
 
 def courses(problem: Problem) -> list[Course]:
@@ -40,12 +43,12 @@ def courses(problem: Problem) -> list[Course]:
 
 def _course(problem: Problem, r: int, length: int) -> Course:
     rows, c = problem.rows[r], problem.calibrated
-    to_parameters = np.zeros((c.size, len(problem.parameters)))
-    to_coefficients = np.zeros((c.size, len(problem.equations.candidates)))
+    to_parameters = np.zeros((c.size, problem.parameters.shape[1]))
+    to_coefficients = np.zeros((c.size, problem.equations.size))
     for j in range(c.size):
         table = to_parameters if j < c.parameters else to_coefficients
         table[j, c.place[j]] = c.recordings[r, j]
-    known = problem.parameters.copy()
+    known = problem.parameters[r].copy()
     known[c.place[: c.parameters]] = 0.0
     lack = length - len(rows.times)
 
@@ -73,13 +76,19 @@ def model_at(
     )
 
 
+def effect_coefficients(slots: Float[Array, " slot"], onehot: Float[Array, "row coefficient"]) -> Array:
+    """The coefficient vector of a combination's values; the last row of `onehot` is always on."""
+    return jnp.append(slots, 1.0) @ onehot
+
+
 @eqx.filter_jit
-def _sensitivities(equations, integrator, course, zs, onehots, rows):
-    """Readings (lane, time, channel) and their slopes (lane, local, time, channel) over the first `rows` rows."""
-    state, f = 2 * equations.dim, course.to_parameters.shape[0]
+def _sensitivities(equations, integrator, course, zs, onehots, directions, rows):
+    """Readings (lane, time, channel) and their slopes (lane, direction, time, channel) over the first `rows` rows."""
+    state, f = 2 * equations.width, course.to_parameters.shape[0]
 
     def readings(z, onehot):
-        flow, read = model_at(equations, integrator, course, z[state : state + f], z[state + f :] @ onehot)
+        coefficients = effect_coefficients(z[state + f :], onehot)
+        flow, read = model_at(equations, integrator, course, z[state : state + f], coefficients)
 
         def body(k, carry):
             x, out = carry
@@ -89,12 +98,12 @@ def _sensitivities(equations, integrator, course, zs, onehots, rows):
         empty = jnp.zeros((course.times.shape[0], len(equations.columns)))
         return jax.lax.fori_loop(0, rows, body, (z[:state], empty))[1]
 
-    def lane(z, onehot):
+    def lane(z, onehot, along):
         # Forward mode: few unknowns, many readings, and a number of rows that is data.
         slope = lambda tangent: jax.jvp(lambda one: readings(one, onehot), (z,), (tangent,))  # noqa: E731
-        return jax.vmap(slope, out_axes=(None, 0))(jnp.eye(z.shape[0]))
+        return jax.vmap(slope, out_axes=(None, 0))(along)
 
-    return jax.vmap(lane)(zs, onehots)
+    return jax.vmap(lane)(zs, onehots, directions)
 
 
 @dataclass(frozen=True)
@@ -113,26 +122,76 @@ class Stepper:
         self.courses = courses(problem)
         self.jobs = jobs
 
+    def on(self, problem: Problem) -> "Stepper":
+        """The same for a problem that differs only in which readings count."""
+        other = Stepper.__new__(Stepper)
+        other.problem, other.courses, other.jobs = problem, self.courses, self.jobs
+        return other
+
     def predict(
         self, zs: Float[np.ndarray, "lane z"], combinations: Sequence[Combination], rows: Sequence[int]
     ) -> list[Predictions]:
         """Predictions by recording, over its first `rows[r]` rows."""
-        onehots = np.stack([self.problem.onehot(c) for c in combinations])
         chunks = [slice(a, a + LANES) for a in range(0, len(zs), LANES)]
         work = [(r, chunk) for r in range(len(self.courses)) for chunk in chunks]
         with ThreadPoolExecutor(max(1, self.jobs)) as pool:
-            parts = list(pool.map(lambda w: self._chunk(zs, onehots, rows[w[0]], *w), work))
+            parts = list(pool.map(lambda w: self._chunk(zs, combinations, rows[w[0]], *w), work))
         return [_joined(parts[r * len(chunks) : (r + 1) * len(chunks)]) for r in range(len(self.courses))]
 
-    def _chunk(self, zs: np.ndarray, onehots: np.ndarray, rows: int, r: int, chunk: slice) -> Predictions:
+    def _chunk(
+        self, zs: np.ndarray, combinations: Sequence[Combination], rows: int, r: int, chunk: slice
+    ) -> Predictions:
         p = self.problem
-        count = len(zs[chunk])
-        some = np.resize(zs[chunk][:, p.local(r)], (LANES, p.state + p.calibrated.size + SLOTS))
-        hots = np.resize(onehots[chunk], (LANES, *onehots.shape[1:]))
+        local, some = p.local(r), list(combinations[chunk])
+        free = [np.nonzero(p.active(c)[local])[0] for c in some]
+        hots = np.stack([p.onehot(c, r) for c in some])
+        out, along = self._run(r, zs[chunk][:, local], hots, free, rows)
+        slopes = np.zeros((len(some), len(local), rows, p.channels))
+        for lane, places in enumerate(free):
+            slopes[lane, places] = along[lane, : len(places), :rows]
+        return Predictions(out[:, :rows], slopes)
+
+    def _run(self, r: int, local_z: np.ndarray, hots: np.ndarray, along: Sequence[np.ndarray], rows: int):
+        """Readings of at most `LANES` lanes and their slopes along the entries that `along` names."""
+        number, p = len(local_z), self.problem
+        lanes = np.arange(LANES) % number
+        width = -(-max(1, *map(len, along)) // DIRECTIONS) * DIRECTIONS
+        directions = np.zeros((number, width, local_z.shape[1]))
+        for lane, places in enumerate(along):
+            directions[lane, np.arange(len(places)), places] = 1.0
+        some, matrices, along_some = (jnp.asarray(a[lanes]) for a in (local_z, hots, directions))
         out, slopes = _sensitivities(
-            p.equations, p.integrator, self.courses[r], jnp.asarray(some), jnp.asarray(hots), jnp.asarray(rows)
+            p.equations, p.integrator, self.courses[r], some, matrices, along_some, jnp.asarray(rows)
         )
-        return Predictions(np.asarray(out)[:count, :rows], np.asarray(slopes)[:count, :, :rows])
+        return np.asarray(out)[:number], np.asarray(slopes)[:number]
+
+    def responses(
+        self, z: Float[np.ndarray, " z"], combination: Combination, laid: Sequence[Any], rows: int, r: int
+    ) -> list[np.ndarray]:
+        """Slopes (local, time, channel) of one recording's readings along the amplitudes of further effects.
+
+        `laid` are lanes of further effects as `_scan.layout` has them, at most `LANES`; `combination` moves at `z`.
+        """
+        p, local = self.problem, self.problem.local(r)
+        fixed = p.coefficients(r, z, combination) - p.coefficients(r, z, ())
+        nuisance = p.state + p.calibrated.size
+        some, hots, along = [], [], []
+        for values, matrix, amplitudes in laid:
+            own = z[local].copy()
+            own[nuisance:] = values
+            hot = matrix.copy()
+            hot[-1] += fixed
+            some.append(own)
+            hots.append(hot)
+            unseen = [p.equations.width - 1, 2 * p.equations.width - 1] if matrix[-1].any() else []
+            along.append(np.concatenate([unseen, nuisance + np.concatenate(amplitudes)]).astype(int))
+        _, slopes = self._run(r, np.stack(some), np.stack(hots), along, rows)
+        out = []
+        for lane, places in enumerate(along):
+            full = np.zeros((len(local), rows, p.channels))
+            full[places] = slopes[lane, : len(places), :rows]
+            out.append(full)
+        return out
 
 
 def _joined(parts: list[Predictions]) -> Predictions:

@@ -9,6 +9,7 @@ from ._calibrate import Fits, Priors, normal_equations, residuals, weights
 from ._coloured import Colour, fit_colour, whitened_gram, whitened_series
 from ._evidence import Laplace, laplace, variance_inflation
 from ._problem import Combination, Problem
+from ._scatter import factor_evidence, law_gain
 from ._trajectory import Stepper
 
 # A remainder of the sensor is smaller than this share of what it reads; else it is the signal.
@@ -16,6 +17,15 @@ _REMAINDER = 0.3
 
 
 @dataclass(frozen=True)
+class Mode:
+    """One optimum of several."""
+
+    log_evidence: float
+    z: Float[np.ndarray, " z"]
+    covariance: Float[np.ndarray, "z z"]
+
+
+@dataclass(frozen=True, eq=False)
 class Estimate:
     """A combination fitted under one kind of remainder.
 
@@ -34,6 +44,8 @@ class Estimate:
     intensity: Float[np.ndarray, " d"] | None = None
     paths: list[np.ndarray] | None = field(default=None, repr=False)
     colours: tuple[Colour, ...] = ()
+    modes: tuple[Mode, ...] = ()  # all optima that were found, this one among them
+    outliers: tuple[tuple[float, float], ...] = ()  # share and size by channel, where they were left out
 
 
 def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -> list[Estimate]:
@@ -44,10 +56,14 @@ def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -
     square = sum((w * (x / fits.noise[:, None]) ** 2).sum((1, 2)) for w, x in zip(weight, r, strict=True))
     offset = _constant(weight, fits.noise)
     out = []
+    number = sum((w > 0).sum(0) for w in weight)
     for b, combination in enumerate(fits.combinations):
         gram = np.block([[np.full((1, 1), square[b]), vector[b][None]], [vector[b][:, None], matrix[b]]])
         one = _laplace(problem, combination, gram, offset[b], fits.z[b], priors)
         scores = _scores(problem, fits, b, r, weight)
+        errors = standardised([x[b] for x in r], weight, fits.noise[b])
+        value = one.log_evidence + law_gain(problem, combination, errors, fits.noise[b])
+        value += factor_evidence(problem, combination, fits.noise[b], number)
         out.append(
             Estimate(
                 combination,
@@ -55,7 +71,7 @@ def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -
                 fits.z[b],
                 one.covariance,
                 fits.noise[b],
-                one.log_evidence,
+                value,
                 bool(fits.converged[b]),
                 variance_inflation(scores),
             )  # fmt: skip
@@ -64,7 +80,10 @@ def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -
 
 
 def weigh_coloured(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -> list[Estimate]:
-    """Estimates where each channel's error has a memory: generalised least squares about the trajectory fit."""
+    """Estimates where each channel's error has a memory: generalised least squares about the trajectory fit.
+
+    None for a combination with a wrongly given noise, which a colour would only blur.
+    """
     weight, lanes = weights(problem, rows), len(fits.z)
     r = residuals(problem, fits.predictions, weight)
     times = [rows_.times[:n] for rows_, n in zip(problem.rows, rows, strict=True)]
@@ -81,9 +100,11 @@ def weigh_coloured(problem: Problem, fits: Fits, priors: Priors, rows: list[int]
             grams[:, j] += gram
             logs[:, j] += log
     number = sum((w > 0).sum(0) for w in weight)
+    trusting = [b for b in range(lanes) if np.array_equal(problem.noise_of(fits.combinations[b]), problem.noise,
+                                                          equal_nan=True)]  # fmt: skip
     return [
         _coloured_estimate(problem, fits, b, grams[b], logs[b], number, tuple(c[b] for c in chosen), priors)
-        for b in range(lanes)
+        for b in trusting
     ]
 
 
@@ -121,7 +142,13 @@ def _laplace(problem: Problem, combination: Combination, gram, offset: float, z,
         return Laplace(-np.inf, np.zeros(problem.size), np.zeros((problem.size, problem.size)))
     precision = priors.precision_of(problem, combination)
     active, lower = problem.active(combination), problem.lower_bounds(combination)
-    return laplace(gram, offset, z, priors.mean, precision, active, lower)
+    return laplace(gram, offset, z, priors.mean_of(problem, combination), precision, active, lower)
+
+
+def standardised(r: list[np.ndarray], weight: list[np.ndarray], noise: np.ndarray) -> Float[np.ndarray, "row channel"]:
+    """Errors of the readings by their own noise, recordings end to end; NaN where nothing was read."""
+    parts = [np.where(w > 0, np.sqrt(w) * x / noise, np.nan) for x, w in zip(r, weight, strict=True)]
+    return np.concatenate(parts)
 
 
 def _constant(weight: list[np.ndarray], noise: np.ndarray) -> np.ndarray:

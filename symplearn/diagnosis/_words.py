@@ -1,146 +1,139 @@
-"""What an engineer would write about a finding, and which recording would tell rivals apart."""
+"""What an engineer would write about a finding."""
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from .._effects import Candidate
-from ._posterior import Posterior
-from ._problem import Combination, Problem
+from .._vocabulary import PAIR, VOCABULARY
+from ._consequences import Said, consequence
+from ._law_text import equation_lines as equation_lines
+from ._law_text import law_text as law_text
+from ._law_text import symbolic_law
+from ._next import next_measurement as next_measurement
 
 _OPENINGS = {
-    "viscous_damping": "A force against the motion of {target}, proportional to its speed, was left out: {law}.",
-    "quadratic_drag": "A force against the motion of {target}, as the square of its speed, was left out: {law}.",
-    "coulomb_friction": "Dry friction on {target}, of constant size against the motion, was left out: {law}.",
-    "constant_force": "A constant force on {target} was left out: {law}.",
-    "linear_stiffness": "A restoring force proportional to {target} was left out: {law}.",
-    "quadratic_stiffness": "A force as the square of {target}, uneven on its two sides, was left out: {law}.",
-    "cubic_stiffness": "A force that grows with the cube of {target} was left out: {law}.",
-    "sensor_bias": "The sensor of {target} reads off by a constant: {law}.",
-    "sensor_gain": "The sensor of {target} reads in a wrong scale: {law}.",
+    "viscous_damping": "A force against the motion of {q}, proportional to its speed, was left out",
+    "quadratic_drag": "A force against the motion of {q}, as the square of its speed, was left out",
+    "coulomb_friction": "Dry friction on {q}, of constant size against the motion, was left out",
+    "relative_damping": "A damping between {q} and {q2}, against their motion relative to each other, was left out",
+    "self_excitation": "A force along the velocity of {q}, which changes sign with its amplitude, was left out",
+    "constant_force": "A constant force on {q} was left out",
+    "linear_stiffness": "A force proportional to {q} was left out",
+    "quadratic_stiffness": "A force as the square of {q}, uneven on its two sides, was left out",
+    "cubic_stiffness": "A force that grows with the cube of {q} was left out",
+    "coupling_spring": "A spring between {q} and {q2} was left out",
+    "contact_stop": "An elastic stop that {q} runs into from {side} was left out",
+    "central_correction": "A central force in the plane of {q} and {q2}, as 1/r^4, was left out",
+    "gyroscopic_coupling": "A gyroscopic force between {q} and {q2} was left out",
+    "periodic_forcing": "A periodic force on {q} was left out",
+    "impulse": "A blow to {q} was left out",
+    "parametric_modulation": "The parameter {q} is not constant but swings",
+    "parameter_drift": "The parameter {q} is not constant but drifts",
+    "regime_change": "The parameter {q} changes suddenly during the recording",
+    "hidden_oscillator": "An oscillator z that nobody reads is coupled to {q}",
+    "parameter_error": "The value of {q} given as known does not fit the recording",
+    "sensor_noise": "The readings of {q} do not scatter as the noise given as known says",
+    "sensor_bias": "The sensor of {q} reads off by a constant",
+    "sensor_gain": "The sensor of {q} reads in a wrong scale",
+    "sensor_drift": "The reading of {q} drifts away from what it should show",
+    "sensor_delay": "The sensor of {q} is late",
+    "sensor_outliers": "Some readings of {q} are off by far more than the noise",
+    "unnamed_force": "A force on {q} that has no name in the vocabulary was left out",
 }
-_LAWS = {
-    "viscous_damping": "-{c} v",
-    "quadratic_drag": "-{c} |v| v",
-    "coulomb_friction": "-{c} sign(v)",
-    "constant_force": "{c}",
-    "linear_stiffness": "-{c} q",
-    "quadratic_stiffness": "-{c} q^2",
-    "cubic_stiffness": "-{c} q^3",
+# Plain words for an effect that a finding is hard to tell from.
+_NOUNS = {
+    "viscous_damping": "a viscous damping",
+    "quadratic_drag": "a quadratic drag",
+    "coulomb_friction": "dry friction",
+    "relative_damping": "a relative damping",
+    "self_excitation": "a self-excitation",
+    "constant_force": "a constant force",
+    "linear_stiffness": "a linear stiffness",
+    "quadratic_stiffness": "a quadratic stiffness",
+    "cubic_stiffness": "a cubic stiffness",
+    "coupling_spring": "a spring",
+    "contact_stop": "an elastic stop",
+    "central_correction": "a central force as 1/r^4",
+    "gyroscopic_coupling": "a gyroscopic coupling",
+    "periodic_forcing": "a periodic force",
+    "impulse": "a blow",
+    "parametric_modulation": "a periodic change",
+    "parameter_drift": "a slow drift",
+    "regime_change": "a sudden change",
+    "hidden_oscillator": "a hidden oscillator",
+    "parameter_error": "a wrong value",
+    "sensor_noise": "another noise",
+    "sensor_bias": "a constant error",
+    "sensor_gain": "a wrong scale",
+    "sensor_drift": "a drift",
+    "sensor_delay": "a delay",
+    "sensor_outliers": "outliers",
+    "unnamed_force": "a force without a name",
 }
-_DOES = {
-    "viscous_damping": "It takes energy out of every swing in proportion, so the amplitude decays exponentially.",
-    "quadratic_drag": "It takes more out of large swings than of small ones.",
-    "coulomb_friction": "The amplitude falls by the same amount every swing until the motion stops.",
-    "constant_force": "It moves the point of rest and leaves the energy alone.",
-    "linear_stiffness": "It shifts the frequency at every amplitude.",
-    "quadratic_stiffness": "It makes the motion uneven about its point of rest.",
-    "cubic_stiffness": "It makes the frequency depend on the amplitude.",
-    "sensor_bias": "The motion itself is as simulated.",
-    "sensor_gain": "The motion itself is as simulated.",
+_PREPOSITIONS = {
+    "impulse": "to",
+    "hidden_oscillator": "coupled to",
+    "contact_stop": "for",
+    **dict.fromkeys(("parametric_modulation", "parameter_drift", "regime_change", "parameter_error"), "of"),
+    **{name: "in the readings of" for name in _NOUNS if name.startswith("sensor_")},
+    **dict.fromkeys(("relative_damping", "coupling_spring", "gyroscopic_coupling"), "between"),
+    "central_correction": "in the plane of",
 }
-# Which recording unmasks rivals: pairs of effect sets that are taken for each other, and what tells them apart.
-_UNMASK: tuple[tuple[frozenset[str], str], ...] = (
-    (
-        frozenset({"viscous_damping", "quadratic_drag", "coulomb_friction"}),
-        "a recording that starts at twice the amplitude and goes on until the motion has nearly died: the laws of "
-        "friction differ most between fast and slow motion",
-    ),
-    (
-        frozenset({"constant_force", "sensor_bias"}),
-        "a reading of the sensor at a place known otherwise, or the apparatus turned round: a force changes sign, a "
-        "bias does not",
-    ),
-    (
-        frozenset({"constant_force", "quadratic_stiffness", "sensor_bias"}),
-        "a recording at a very different amplitude, and one at rest: a force and a bias stay, an uneven stiffness "
-        "fades with the amplitude",
-    ),
-    (
-        frozenset({"sensor_gain", "cubic_stiffness", "linear_stiffness"}),
-        "a recording at half the amplitude, and the sensor held against a ruler: a gain scales both alike, a "
-        "stiffness changes the frequency",
-    ),
-    (
-        frozenset({"linear_stiffness", "quadratic_stiffness", "cubic_stiffness"}),
-        "recordings at several amplitudes: the frequency's dependence on amplitude tells the powers apart",
-    ),
-    (
-        frozenset({"viscous_damping", "sensor_bias", "constant_force"}),
-        "a longer recording: a bias stays where a decay ends",
-    ),
-)
-
-
-def number(value: float) -> str:
-    """A number with four significant digits."""
-    return f"{value:.4g}"
-
-
-def symbol_of(candidate: Candidate) -> str:
-    """The equation of one effect, with its coefficient's name."""
-    law, name = _LAWS.get(candidate.effect.name), candidate.effect.coefficient
-    if law is None:
-        return f"y + {name}" if candidate.effect.name == "sensor_bias" else f"(1 + {name}) y"
-    return f"F = {law.format(c=name)}".replace("--", "")
 
 
 def finding_sentence(
-    candidate: Candidate, mean: float, sd: float, share: float, unit: str, rivals: Sequence[str]
+    one: Candidate,
+    coefficients: Mapping[str, Any],
+    share: float | None,
+    units: Mapping[str, str | None],
+    rivals: Sequence[str],
+    only: Sequence[int] | None,
 ) -> str:
-    """Cause, law with its number, how strong, what it does, what it cannot be told from."""
-    name = candidate.effect.coefficient
-    known = f"{symbol_of(candidate)} with {name} = {number(mean)} +- {number(sd)}{' ' + unit if unit else ''}"
-    words = [_OPENINGS[candidate.effect.name].format(target=candidate.target, law=known)]
-    if candidate.effect.acts_on == "coordinate":
-        words.append(f"It is about {100 * share:.2g} % of the forces already there.")
-    words.append(_DOES[candidate.effect.name])
+    """What was left out and where, its law with numbers, how strong it is, what it does, what it is hard to tell from.
+
+    **Arguments:** - `coefficients`: mean, sd and interval95 by name; for `unnamed_force` its `expression`, a text.
+    - `share`: rms of the effect's force over that of the forces already there; `None` where it is no force.
+    - `units`: by coefficient, `None` where unknown. - `rivals`: effects such as `quadratic_drag(theta)`.
+    - `only`: the recordings, from 1, that it is in; `None` for all.
+    """
+    said = Said(one, coefficients, units)
+    opening = _OPENINGS[one.effect.name].format(q=one.targets[0], q2=one.targets[-1], side=_side(one))
+    words = [f"{opening}: {_law_with_numbers(said)}."]
+    if only:
+        words.append(f"It is in recording{'s' if len(only) > 1 else ''} {_listed([str(r) for r in only], 'and')} only.")
+    if share is not None and math.isfinite(share):
+        words.append(f"Its force is about {100 * share:.2g} % of the forces already there.")
+    words.append(consequence(said))
     if rivals:
-        words.append(f"This recording hardly tells it from {_listed(rivals)}.")
+        words.append(f"This recording hardly tells it from {_listed([in_words(rival) for rival in rivals], 'or')}.")
     return " ".join(words)
 
 
-def next_measurement(problem: Problem, posterior: Posterior, chosen: Combination | None) -> str:
-    """Which recording would tell the remaining alternatives apart."""
-    likeliest = max((w.probability for w in posterior.named), default=0.0)
-    rivals = [w.combination for w in posterior.named if w.probability > max(0.02, 0.1 * likeliest)][:6]
-    if chosen is None and posterior.as_it_is > 0.05:
-        if not rivals or posterior.as_it_is > 0.9:
-            return "none is needed; a longer recording at another amplitude would test the simulation harder"
-    names = [{problem.equations.candidates[c].effect.name for c in rival} for rival in rivals]
-    shared = frozenset[str]().union(*names[:1]).intersection(*names)
-    disputed = frozenset[str]().union(*names) - shared
-    advice = [text for kin, text in _UNMASK if len(kin & disputed) >= 2 or (len(kin & disputed) == 1 and len(kin) == 2)]
-    if chosen is None and posterior.unexplained > 0.5:
-        advice.append("more channels and a faster sampling where the strain is largest, to see what acts there")
-    if not advice:
-        return "a recording at another amplitude, to test the law outside the range it was found in"
-    return "; also ".join(dict.fromkeys(advice[:2]))
+def _law_with_numbers(said: Said) -> str:
+    """`F = -c v, where c = 0.03 +- 0.002 N`."""
+    names = said.one.effect.coefficients
+    if not names:
+        return law_text(said.one, {"expression": said.coefficients["expression"]})
+    return f"{symbolic_law(said.one)}, where {_listed([f'{name} = {said.value(name)}' for name in names], 'and')}"
 
 
-def equation_lines(problem: Problem, hamiltonian: str, forces: Mapping[str, str], readings: Mapping[str, str],
-                   chosen: Iterable[tuple[Candidate, float]]) -> tuple[str, ...]:  # fmt: skip
-    """The equations of motion and readings as text, with the chosen effects' numbers in place."""
-    chosen, eq = list(chosen), problem.equations
-    lines = [f"H = {hamiltonian}"]
-    for i, (q, p) in enumerate(zip(eq.coordinates, eq.momenta, strict=True)):
-        right = f"-dH/d{q}"
-        right += f" + {forces[p]}" if p in forces else ""
-        for one, value in chosen:
-            if one.effect.acts_on == "coordinate" and one.place == i:
-                right += _added(_LAWS[one.effect.name], value).replace("q", q).replace("v", f"d{q}/dt")
-        lines += [f"d{q}/dt = dH/d{p}", f"d{p}/dt = {right}"]
-    for j, (column, h) in enumerate(readings.items()):
-        mine = {one.effect.name: value for one, value in chosen if one.effect.family == "sensor" and one.place == j}
-        text = f"{number(1 + mine['sensor_gain'])} ({h})" if "sensor_gain" in mine else h
-        text += _added("{c}", mine["sensor_bias"]) if "sensor_bias" in mine else ""
-        lines.append(f"{column} = {text}")
-    return tuple(lines)
+def in_words(rival: str) -> str:
+    """`quadratic_drag(theta)` as `a quadratic drag on theta`; what has another form stays as it is."""
+    match = re.fullmatch(r"(\w+)\((.*)\)([^)]*)", rival)
+    if match is None or match[1] not in _NOUNS:
+        return rival
+    name, targets, rest = match.groups()
+    if VOCABULARY[name].target == PAIR:
+        targets = targets.replace(", ", " and ")
+    return f"{_NOUNS[name]} {_PREPOSITIONS.get(name, 'on')} {targets}{rest}"
 
 
-def _added(law: str, value: float) -> str:
-    """A term with its sign: ` - 0.03 v`."""
-    negative = law.startswith("-") != (value < 0)
-    return f" {'-' if negative else '+'} {law.lstrip('-').format(c=number(abs(value)))}"
+def _side(one: Candidate) -> str:
+    """Where a body comes from that runs into a stop."""
+    return "above" if one.side == "lower" else "below"
 
 
-def _listed(words: Sequence[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
+def _listed(words: Sequence[str], joint: str) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {joint} {words[-1]}"

@@ -17,8 +17,15 @@ class Part(NamedTuple):
 
 
 def equation_pairs(before: tuple[str, ...], after: tuple[str, ...]) -> list[tuple[str, list[Part]]]:
-    """Each equation as it was, and as it is now, in parts."""
-    return [(old, parts(old, now)) for old, now in zip_longest(before, after, fillvalue="")]
+    """Each equation as it was, and as it is now, in parts; one of the two is empty where the other has no like.
+
+    Equations are alike that have the same left side.
+    """
+    old, now = ([line.split(" = ")[0] for line in lines] for lines in (before, after))
+    pairs: list[tuple[str, str]] = []
+    for _, i, j, k, m in difflib.SequenceMatcher(None, old, now, autojunk=False).get_opcodes():
+        pairs += zip_longest(before[i:j], after[k:m], fillvalue="")
+    return [(was, parts(was, is_now) if is_now else []) for was, is_now in pairs]
 
 
 def parts(old: str, now: str) -> list[Part]:

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from ..diagnosis._record import Diagnosis, Series
 from ._decimate import evenly
-from ._law import added_force
+from ._law import Motion, added_force
 from ._palette import AFTER, LAW
 from ._panel import Panel, finite, first_look, labels, legend, limits, line, panel, with_unit
 from ._units import force_unit, time_unit
@@ -35,6 +35,7 @@ def missing(diagnosis: Diagnosis, series: Series, number: int, coordinate: str) 
     """The missing force on a coordinate in recording `number`, counted from 1."""
     i, units, time = diagnosis.coordinates.index(coordinate), diagnosis.units, time_unit(diagnosis)
     q, v = series.position[:, i], series.velocity[:, i]
+    motion = Motion(series.fitted_times, series.position, series.velocity)
     unit = units.get(coordinate)
     changed = diagnosis.document["verdict"] != "consistent"
     return Missing(
@@ -43,7 +44,7 @@ def missing(diagnosis: Diagnosis, series: Series, number: int, coordinate: str) 
         v,
         series.force_before[:, i],
         series.force_after[:, i] if changed else None,
-        added_force(diagnosis.document["findings"], coordinate, q, v, number),
+        added_force(diagnosis.document["findings"], diagnosis.coordinates, coordinate, motion, number),
         with_unit("time", time),
         with_unit(coordinate, unit),
         with_unit(f"velocity of {coordinate}", f"{unit}/{time}" if unit and time else None),

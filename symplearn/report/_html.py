@@ -34,7 +34,7 @@ def html_report(diagnosis: Diagnosis) -> str:
         fit=_fit_rows(diagnosis),
         parameters=_parameter_rows(document["parameters"], diagnosis.units),
         remaining=_remaining(document["fit"], changed),
-        alternatives=_alternatives(document),
+        alternatives=_alternatives(document, len(diagnosis.series)),
         recordings=[f"{i}: {plain(series.name)}" for i, series in enumerate(diagnosis.series, 1)],
     )
 
@@ -76,12 +76,13 @@ def _finding(finding: Mapping[str, Any], diagnosis: Diagnosis) -> dict[str, Any]
             "mean": number(value["mean"]) if isinstance(value, Mapping) else str(value),
             "sd": number(value["sd"], 2) if isinstance(value, Mapping) else DASH,
             "interval": interval(value["interval95"]) if isinstance(value, Mapping) else DASH,
-            "unit": coefficient_unit(finding, diagnosis) or "",
+            "unit": coefficient_unit(finding, diagnosis, name) or "",
         }
         for name, value in finding["coefficients"].items()
     ]
     units = any(coefficient["unit"] for coefficient in coefficients)
-    return {"effect": effect(finding), "record": finding, "coefficients": coefficients, "units": units}
+    said = effect(finding, len(diagnosis.series))
+    return {"effect": said, "record": finding, "coefficients": coefficients, "units": units}
 
 
 def _fit_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str, str]]:
@@ -128,13 +129,13 @@ def _remaining(fit: Mapping[str, Any], changed: bool) -> list[str]:
     ]
 
 
-def _alternatives(document: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _alternatives(document: Mapping[str, Any], recordings: int) -> list[tuple[str, str]]:
     """What else was weighed, with its probability; the last row is all the rest."""
     unexplained = document["verdict"] == "unexplained"
-    reported = combination(document["findings"], unexplained) + " (reported)"
+    reported = combination(document["findings"], unexplained, recordings) + " (reported)"
     rows = [(reported, probability(document["probability"]))]
     rows += [
-        (combination(one["findings"], one.get("unexplained", False)), probability(one["probability"]))
+        (combination(one["findings"], one.get("unexplained", False), recordings), probability(one["probability"]))
         for one in document["alternatives"]
     ]
     return [*rows, ("all other combinations together", probability(document["other"]))]

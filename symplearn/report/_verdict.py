@@ -19,17 +19,23 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         return f"The simulation agrees with the recording; nothing needs to be added ({chance})."
     if document["verdict"] == "unexplained":
         return f"The simulation and the recording differ, and no effect with a name explains it ({chance})."
-    return f"The simulation left something out: {combination(document['findings'])} ({chance})."
+    found = combination(document["findings"], recordings=len(diagnosis.series))
+    return f"The simulation left something out: {found} ({chance})."
 
 
 def where_and_when(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Pairs of a word and what it says: where it lives, on what, in which recordings, and when."""
     place, count = diagnosis.document["location"], len(diagnosis.series)
-    lines = [("Part", plain(place["kind"])), ("On", ", ".join(map(plain, place["targets"])))]
+    lines = [("Part", plain(place["kind"])), ("On", ", ".join(map(_target, place["targets"])))]
     if count > 1:
         lines.append(("Recordings", ", ".join(str(r) for r in place["recordings"])))
     lines.append(("Time", "; ".join(_window(window, diagnosis) for window in place["time_windows"])))
     return [(word, says) for word, says in lines if says]
+
+
+def _target(target: str | list[str]) -> str:
+    """A name, or a pair of them."""
+    return plain(target) if isinstance(target, str) else " and ".join(map(plain, target))
 
 
 def _window(window: list[Any], diagnosis: Diagnosis) -> str:

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from .._errors import printable
+from .._vocabulary import COLUMN, PARAMETER, VOCABULARY
 
 DASH = "–"
 
@@ -52,15 +53,39 @@ def ratio(before: float | None, after: float | None) -> str:
     return number(before / after, 3)
 
 
-def effect(finding: Mapping[str, Any]) -> str:
-    """`viscous damping on theta`: an effect and its target, in words."""
+def targets(finding: Mapping[str, Any]) -> list[str]:
+    """The names an effect acts on: one, or two."""
     target = finding["target"]
-    places = [target] if isinstance(target, str) else list(target)
-    return f"{plain(finding['effect']).replace('_', ' ')} on {' and '.join(map(plain, places))}"
+    return [target] if isinstance(target, str) else list(target)
 
 
-def combination(findings: list[Mapping[str, Any]], unexplained: bool = False) -> str:
+def side(finding: Mapping[str, Any]) -> str | None:
+    """The side of a stop, `upper` or `lower`; it stands beside the coefficients or among them."""
+    return finding.get("side") or finding.get("coefficients", {}).get("side")
+
+
+def effect(finding: Mapping[str, Any], recordings: int = 1) -> str:
+    """`viscous damping on theta`: an effect and its target, in words; with its recordings where not in all."""
+    name, places = plain(finding["effect"]), [plain(target) for target in targets(finding)]
+    where = f"between {' and '.join(places)}" if len(places) > 1 else f"{_preposition(name)} {places[0]}"
+    which = f"{plain(side(finding))} " if side(finding) else ""
+    return f"{which}{name.replace('_', ' ')} {where}{_only(finding, recordings)}"
+
+
+def _preposition(name: str) -> str:
+    return "of" if name in VOCABULARY and VOCABULARY[name].target in (PARAMETER, COLUMN) else "on"
+
+
+def _only(finding: Mapping[str, Any], recordings: int) -> str:
+    """` in recording 2 only`."""
+    mine = finding.get("recordings") or []
+    if not mine or len(mine) >= recordings:
+        return ""
+    return f" in recording{'s' if len(mine) > 1 else ''} {' and '.join(map(str, mine))} only"
+
+
+def combination(findings: list[Mapping[str, Any]], unexplained: bool = False, recordings: int = 1) -> str:
     """A combination of effects in words, or one of the two without any."""
     if findings:
-        return ", ".join(map(effect, findings))
+        return ", ".join(effect(one, recordings) for one in findings)
     return "something without a name (process noise alone)" if unexplained else "nothing left out"

@@ -1,0 +1,312 @@
+"""Everything that is said about a finished search."""
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from .._effects import COORDINATE, PAIR, Candidate
+from .._expression import Expression
+from . import _document as document
+from ._along import energy
+from ._augment import augmented
+from ._build import rows_fitted
+from ._coefficients import coefficients
+from ._effect_priors import STRENGTH
+from ._forecast import forecast
+from ._found import Found
+from ._locate import (
+    kind_and_targets,
+    motion,
+    present_windows,
+    strained_coordinates,
+    strained_windows,
+    where_sentence,
+    whole_windows,
+)
+from ._options import Options
+from ._outlook import Outlook, intensity_of
+from ._posterior import CONSISTENT, Posterior, Weighed, posterior
+from ._problem import Combination, Problem
+from ._record import Diagnosis, Forecast, Series
+from ._trajectory import Stepper
+from ._units import coefficient_units, time_unit
+from ._unnamed import written
+from ._warnings import warnings
+from ._weighed import Estimate, coloured_inflation
+from ._words import equation_lines, finding_sentence, next_measurement
+
+VERSION = "0.1.0"
+
+
+class Answer:
+    """Everything that is said about a finished search."""
+
+    def __init__(self, file, recordings, stepper: Stepper, found: Found, options: Options, times: np.ndarray | None):
+        self.times = times
+        self.file, self.recordings, self.stepper, self.found, self.options = file, recordings, stepper, found, options
+        self.problem: Problem = stepper.problem
+        self.posterior: Posterior = posterior(self.problem, found, 1.0)
+        self.chosen, self.verdict = self._verdict()
+        inflation = self._inflation()
+        if inflation > 1:
+            self.posterior = posterior(self.problem, found, inflation)
+            self.chosen, self.verdict = self._verdict()
+        self.before: Estimate = self.posterior.nothing
+        self.after: Estimate = self.chosen.best if self.chosen else self.before
+        # Shown before: the calibrated simulation as it is, which knows no missing force.
+        plain = found.of((), "white") or self.before
+        self.without = self._outlooks(plain, intensity_of(stepper, plain))
+        self.with_ = self._outlooks(self.after, intensity_of(stepper, self.after)) if self.chosen else self.without
+        self.pull = found.of((), "force")
+        self.lens = self._lenses(self.pull or self.before)
+        self.lens_after = self._lenses(self.after)
+
+    def _inflation(self) -> float:
+        """How much the evidence of the likeliest answer claims too much."""
+        rows = rows_fitted(self.problem.rows)
+        top = self.chosen.best if self.chosen else self.posterior.nothing
+        return coloured_inflation(self.stepper, top, rows) if top.kind == "coloured" else max(1.0, top.inflation)
+
+    def _verdict(self) -> tuple[Weighed | None, str]:
+        p = self.posterior
+        if p.as_it_is >= CONSISTENT:
+            return None, "consistent"
+        if not p.named or p.unexplained > p.named[0].probability:
+            return None, "unexplained"
+        return p.named[0], "mismatch"
+
+    def _outlooks(self, estimate: Estimate, intensity: np.ndarray) -> list[Outlook]:
+        return [Outlook(self.stepper, estimate, r, intensity) for r in range(len(self.problem.rows))]
+
+    def _lenses(self, estimate: Estimate) -> list[Outlook]:
+        """Outlooks with the missing force of the simulation without effects: before and after through one lens."""
+        if self.pull is None or self.pull.intensity is None:
+            return self._outlooks(estimate, intensity_of(self.stepper, estimate))
+        return self._outlooks(estimate, self.pull.intensity)
+
+    def diagnosis(self, seconds: float) -> Diagnosis:
+        f, eq, values = self.file, self.problem.equations, self.values
+        chosen: list[tuple[Candidate, Mapping[str, Any]]] = [(self.problem.candidate(m), v) for m, v in values.items()]
+        chosen += [(self.problem.candidate(m), {"expression": e.text}) for m, e in self.expressions.items()]
+        forces = {p: e.text for p, e in f.forces.items()}
+        readings = {c: e.text for c, e in f.recording.observe.items()}
+        lines = (f.coordinates, f.momenta, eq.columns, f.hamiltonian.text, forces, readings)
+        return Diagnosis(
+            title=f.title,
+            document=self._document(seconds),
+            columns=eq.columns,
+            coordinates=f.coordinates,
+            units=f.units,
+            equation_before=equation_lines(*lines, []),
+            equation_after=equation_lines(*lines, chosen),
+            series=tuple(self._series(r) for r in range(len(self.recordings))),
+            augmented=augmented(f, self.problem, self.after, values, self.expressions),
+            forecast=self._forecast(),
+        )
+
+    @cached_property
+    def values(self) -> dict[int, dict[str, float]]:
+        """Point values of the coefficients of every finding, by member."""
+        out = {}
+        for member in self.after.combination:
+            if self.problem.candidate(member).terms:
+                continue
+            told = coefficients(self.problem, self.found.priors, self.after, member, self._spread())
+            out[member] = {name: one["mean"] for name, one in told.items()}
+        return out
+
+    @cached_property
+    def expressions(self) -> dict[int, Expression]:
+        """Forces without a name among the findings, by member."""
+        places = self.problem.placed(self.after.combination)
+        ones = [(m, self.problem.candidate(m).terms, place) for m, place in places]
+        return {m: written(terms, self.after.z[place]) for m, terms, place in ones if terms}
+
+    def _spread(self) -> float:
+        return 1.0 / self.posterior.tempered
+
+    def _document(self, seconds: float) -> dict[str, Any]:
+        p, spread = self.posterior, self._spread()
+        rows, other = document.alternatives(self.problem, p, self.verdict, self.chosen)
+        before = document.fit(self.problem, self.pull or self.before, self.without, self.recordings)
+        after = document.fit(self.problem, self.after, self.with_, self.recordings) if self.chosen else before
+        return {
+            "schema": "symplearn.diagnosis/1",
+            "verdict": self.verdict,
+            "probability": self._probability(),
+            "log_bayes_factor": self._bayes_factor(),
+            "location": self._location(),
+            "findings": self._findings(),
+            "alternatives": rows,
+            "other": other,
+            "family_probability": document.family_probability(self.problem, p),
+            "parameters": {
+                "before": document.parameters(self.problem, self.before, spread),
+                "after": document.parameters(self.problem, self.after, spread),
+            },
+            "fit": {"before": before, "after": after},
+            "next_measurement": self._next(),
+            "warnings": warnings(
+                self.problem, self.recordings, self.found, self.posterior, self.after, self.without, self.with_
+            ),
+            "thinning": {
+                "rows": sum(r.given for r in self.problem.rows),
+                "used": sum(r.used for r in self.problem.rows),
+            },
+            "converged": bool(self.after.converged and all(o.ok and np.isfinite(o.readings).all() for o in self.with_)),
+            "version": VERSION,
+            "seed": self.options.seed,
+            "seconds": round(seconds, 2),
+        }
+
+    def _next(self) -> str:
+        p = self.posterior
+        top = max((w.probability for w in p.named), default=0.0)
+        rivals = [[self.problem.candidate(m).key for m in w.combination]
+                  for w in p.named if w.probability > max(0.02, 0.1 * top)][:6]  # fmt: skip
+        return next_measurement(rivals, self.verdict, p.as_it_is, p.unexplained)
+
+    def _probability(self) -> float:
+        p = self.posterior
+        if self.chosen is not None:
+            return self.chosen.probability
+        return p.as_it_is if self.verdict == "consistent" else p.unexplained
+
+    def _bayes_factor(self) -> float | None:
+        p = self.posterior
+        if self.verdict == "consistent":
+            return None
+        if self.chosen is None:
+            white = self.found.of((), "white")
+            plain = white.log_evidence if white else -np.inf
+            return document.finite(p.tempered * (self.before.log_evidence - plain))
+        return document.finite(p.evidences[self.chosen.combination] - p.evidences[()])
+
+    def _findings(self) -> list[dict[str, Any]]:
+        if self.chosen is None:
+            return []
+        found = [self._finding(member) for member in self.chosen.combination]
+        return sorted(found, key=lambda one: -(one["log_bayes_factor"] or 0.0))
+
+    def _finding(self, member: int) -> dict[str, Any]:
+        p, one = self.posterior, self.problem.candidate(member)
+        rest = tuple(c for c in self.after.combination if c != member)
+        told: dict[str, Any] = {}
+        if one.terms:
+            told["expression"] = self.expressions[member].text
+        else:
+            told = coefficients(self.problem, self.found.priors, self.after, member, self._spread())
+        which = [r + 1 for r in self.problem.members[member].recordings]
+        only = None if len(which) == len(self.recordings) else which
+        f = self.file
+        clock, momenta = time_unit(f.units, f.recording.time), dict(zip(f.coordinates, f.momenta, strict=True))
+        units = coefficient_units(one.effect.name, one.targets, f.units, momenta, clock)
+        found = {
+            "effect": one.effect.name,
+            "target": one.target,
+            "family": one.effect.family,
+            "recordings": which,
+            "probability": document.presence(self.problem, p, member),
+            "log_bayes_factor": self._against(rest),
+            "coefficients": told,
+            "sentence": finding_sentence(one, told, self._strength(member), units, self._rivals(member), only),
+        }
+        return found | ({"side": one.side} if one.side is not None else {})
+
+    def _against(self, rest: Combination) -> float | None:
+        """Log Bayes factor against a smaller combination; against nothing at all where that one cannot be fitted."""
+        mine, without = (self.posterior.evidences.get(c, -np.inf) for c in (self.after.combination, rest))
+        if not np.isfinite(without):
+            without = self.posterior.evidences[()]
+        return document.finite(mine - without)
+
+    def _strength(self, member: int) -> float | None:
+        """Root mean square of an effect's force over that of the forces already there; None where it is no force."""
+        one, place = self.problem.candidate(member), dict(self.problem.placed(self.after.combination))[member]
+        if one.effect.acts_on != COORDINATE:
+            return None
+        amplitudes = self.after.z[place][: one.effect.amplitudes]
+        scales = self.found.priors.scales[one.first : one.first + one.effect.amplitudes]
+        return float(np.linalg.norm(amplitudes / scales)) * STRENGTH
+
+    def _rivals(self, member: int) -> list[str]:
+        """Effects that could stand in this one's place: in a likely combination that lacks it."""
+        mine = {self.problem.candidate(m).key for m in self.after.combination}
+        key, out = self.problem.candidate(member).key, []
+        for w in self.posterior.named:
+            ones = [self.problem.candidate(m) for m in w.combination]
+            if key not in {one.key for one in ones} and w.probability > 0.1 * self._probability():
+                out += [str(one) for one in ones if one.key not in mine]
+        return list(dict.fromkeys(out))[:4]
+
+    def _location(self) -> dict[str, Any]:
+        if self.verdict == "consistent":
+            return {"kind": "none", "targets": [], "recordings": [], "time_windows": [],
+                    "where": "nothing differs that the noise does not explain"}  # fmt: skip
+        if self.chosen is None:
+            return self._unexplained_location()
+        combination = self.chosen.combination
+        kind, targets = kind_and_targets(self.problem, combination)
+        which = sorted({r + 1 for m in combination for r in self.problem.members[m].recordings})
+        windows = present_windows(self.problem, self.lens, combination, self.values)
+        return {"kind": kind, "targets": targets, "recordings": which, "time_windows": windows, "where": self._where()}
+
+    def _where(self) -> str:
+        chosen = [self.problem.candidate(member) for member in self.after.combination]
+        moving = [one.place for one in chosen if one.effect.acts_on in (COORDINATE, PAIR)]
+        if not moving and all(not one.effect.is_dynamics for one in chosen):
+            return f"in the sensor of {', '.join(dict.fromkeys(one.targets[0] for one in chosen))}"
+        first = moving[0] if moving else strained_coordinates(self.lens)[0]
+        return where_sentence(self.problem, self.lens[0], first)
+
+    def _unexplained_location(self) -> dict[str, Any]:
+        eq, several = self.problem.equations, len(self.lens) > 1
+        # A nearly periodic remainder goes with the motion, so a force is likelier than an error of the sensor.
+        if self.before.kind == "coloured" and all(colour.damping >= 1 for colour in self.before.colours):
+            kind, targets = "sensor", list(eq.columns)
+            where = "the readings are off in a way that remembers itself, without a name in the vocabulary"
+            windows = whole_windows(self.lens)
+        else:
+            strained = strained_coordinates(self.lens)
+            kind, targets = "dynamics", [eq.coordinates[i] for i in strained]
+            where = where_sentence(self.problem, self.lens[0], strained[0])
+            found = [(w, o.recording + 1) for o in self.lens for w in strained_windows(o, strained[0])]
+            windows = [[*w, r] if several else w for w, r in found]
+        numbers = list(range(1, len(self.lens) + 1))
+        return {"kind": kind, "targets": targets, "recordings": numbers, "time_windows": windows, "where": where}
+
+    def _series(self, r: int) -> Series:
+        before, after, lens, lens_after = self.without[r], self.with_[r], self.lens[r], self.lens_after[r]
+        n, rows = before.rows.fitted, before.rows
+        position, velocity = motion(lens)
+        return Series(
+            name=self.recordings[r].name,
+            boundary=rows.boundary,
+            times=rows.times,
+            readings=rows.readings,
+            before=before.readings,
+            after=after.readings,
+            fitted_times=rows.times[:n],
+            position=position,
+            velocity=velocity,
+            force_before=lens.missing_force(),
+            force_after=lens_after.missing_force(),
+            strain_before=lens.strain(),
+            strain_after=lens_after.strain(),
+            innovations_before=before.innovations,
+            innovations_after=after.innovations,
+            energy_before=self._energy(lens),
+            energy_after=self._energy(lens_after),
+        )
+
+    def _energy(self, outlook: Outlook) -> np.ndarray:
+        means = np.asarray(outlook.smoothed.means[: outlook.rows.fitted])
+        return outlook.along(energy, means)
+
+    def _forecast(self) -> Forecast | None:
+        if self.times is None:
+            return None
+        return forecast(self.stepper, self.recordings[0], self.before, self.after, self.times, self._spread(),
+                        self.options.seed)  # fmt: skip

@@ -1,0 +1,98 @@
+"""The contract's coefficients of what was found, with their uncertainty."""
+
+from typing import Any
+
+import numpy as np
+from scipy.stats import norm, truncnorm
+
+from .._effects import NOISE, Candidate
+from ._calibrate import Priors
+from ._problem import Problem
+from ._weighed import Estimate, Mode
+
+_DRAWS = 4000
+
+
+def values_of(problem: Problem, estimate: Estimate, member: int) -> dict[str, float]:
+    """Most probable coefficients of one member of a combination, by the contract's names."""
+    one = problem.candidate(member)
+    if one.effect.amplitudes == 0:
+        return dict(_scatter(problem, estimate, one))
+    place = dict(problem.placed(estimate.combination))[member]
+    named = one.effect.named(estimate.z[place], problem.equations.origin)
+    return {name: float(value) for name, value in named.items()}
+
+
+def coefficients(
+    problem: Problem, priors: Priors, estimate: Estimate, member: int, inflation: float
+) -> dict[str, dict[str, Any]]:
+    """Mean, sd and 95 % interval of every coefficient, cut off where a sign is physical."""
+    one = problem.candidate(member)
+    values = values_of(problem, estimate, member)
+    if one.effect.amplitudes == 0:
+        number = sum(float((r.counts[: r.fitted, one.place] > 0).sum()) for r in problem.rows)
+        return {name: _told(value, _sd(name, values, max(number, 1.0))) for name, value in values.items()}
+    place = dict(problem.placed(estimate.combination))[member]
+    if one.effect.size == 1:
+        return {one.effect.coefficients[0]: _single(problem, estimate, place.start, inflation)}
+    draws = _drawn(problem, priors, estimate, place, inflation)
+    named = one.effect.named(draws, problem.equations.origin)
+    return {name: _summary(values[name], named[name], circular=name == "phi") for name in values}
+
+
+def _scatter(problem: Problem, estimate: Estimate, one: Candidate) -> dict[str, float]:
+    if one.effect is NOISE:
+        return {"s": float(estimate.noise[one.place] / problem.noise[one.place])}
+    return dict(zip(("e", "sd"), estimate.outliers[one.place], strict=True))
+
+
+def _sd(name: str, values: dict[str, float], number: float) -> float:
+    """Standard deviation of a factor of the noise, of a share, or of a size, from so many readings."""
+    if name == "e":
+        return float(np.sqrt(values["e"] * (1 - values["e"]) / number))
+    return float(values[name] / np.sqrt(2 * max(number * values.get("e", 1.0), 1.0)))
+
+
+def _told(value: float, sd: float) -> dict[str, Any]:
+    return {"mean": value, "sd": float(sd), "interval95": [max(0.0, value - 1.96 * sd), value + 1.96 * float(sd)]}
+
+
+def _single(problem: Problem, estimate: Estimate, place: int, inflation: float) -> dict[str, Any]:
+    mean = float(estimate.z[place])
+    sd = float(np.sqrt(estimate.covariance[place, place] * inflation))
+    lower = problem.lower_bounds(estimate.combination).get(place)
+    if lower is None or mean - lower > 5 * sd:
+        low, high = (float(x) for x in norm.interval(0.95, mean, sd))
+    else:
+        law = truncnorm((lower - mean) / sd, np.inf, mean, sd)
+        low, high = (float(x) for x in law.ppf([0.025, 0.975]))
+        mean, sd = float(law.mean()), float(law.std())
+    return {"mean": mean, "sd": sd, "interval95": [low, high]}
+
+
+def _drawn(problem: Problem, priors: Priors, estimate: Estimate, place: slice, inflation: float) -> np.ndarray:
+    """Draws of an effect's values from all modes, inside where they may lie."""
+    modes = estimate.modes or (Mode(0.0, estimate.z, estimate.covariance),)
+    top = max(mode.log_evidence for mode in modes)
+    share = np.exp([(mode.log_evidence - top) / inflation for mode in modes])
+    numbers = np.round(_DRAWS * share / share.sum()).astype(int)
+    rng = np.random.default_rng(0)
+    draws = np.concatenate([
+        rng.multivariate_normal(mode.z[place], mode.covariance[place, place] * inflation, number, method="eigh")
+        for mode, number in zip(modes, numbers, strict=True)
+    ])  # fmt: skip
+    lower, upper = priors.bounds_of(problem, estimate.combination)
+    bound = problem.lower_bounds(estimate.combination).get(place.start, -np.inf)
+    draws = np.clip(draws, lower[place], upper[place])
+    return draws[draws[:, 0] >= bound] if (draws[:, 0] >= bound).sum() > _DRAWS // 20 else draws
+
+
+def _summary(value: float, draws: np.ndarray, circular: bool) -> dict[str, Any]:
+    """Mean, sd and interval; of an angle about its most probable value."""
+    if circular:
+        off = np.angle(np.exp(1j * (draws - value)))
+        low, high = np.quantile(off, [0.025, 0.975])
+        mean = float(np.angle(np.exp(1j * (value + off.mean()))))
+        return {"mean": mean, "sd": float(off.std()), "interval95": [value + float(low), value + float(high)]}
+    low, high = np.quantile(draws, [0.025, 0.975])
+    return {"mean": value, "sd": float(draws.std()), "interval95": [float(low), float(high)]}

@@ -1,0 +1,223 @@
+"""What a left-out effect does to energy, frequency, amplitude or readings, as far as its coefficients say."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from .._effects import Candidate
+from ._law_text import number
+
+
+@dataclass(frozen=True)
+class Said:
+    """A finding's coefficients as they are spoken of."""
+
+    one: Candidate
+    coefficients: Mapping[str, Any]
+    units: Mapping[str, str | None]
+
+    def mean(self, name: str) -> float:
+        return float(self.coefficients[name]["mean"])
+
+    def value(self, name: str) -> str:
+        """`0.03 +- 0.002 N/m`."""
+        return _with_unit(self._spread(name, 1.0), self.units.get(name))
+
+    def plain(self, name: str) -> str:
+        """The mean's size alone, with its unit."""
+        return _with_unit(number(abs(self.mean(name))), self.units.get(name))
+
+    def percent(self, name: str) -> str:
+        """A pure number's size, `20 +- 1.5 %`."""
+        return f"{self._spread(name, math.copysign(100.0, self.mean(name)))} %"
+
+    def _spread(self, name: str, factor: float) -> str:
+        mean, sd = (self.coefficients[name].get(key) for key in ("mean", "sd"))
+        return number(factor * mean) + ("" if sd is None else f" +- {number(abs(factor) * sd)}")
+
+    @property
+    def period(self) -> str:
+        """2 pi / omega, `2.99 s`."""
+        omega = self.mean("omega")
+        if omega <= 0:
+            return "unknown"
+        relative = (self.coefficients["omega"].get("sd") or 0.0) / omega
+        spread = f" +- {number(relative * 2 * math.pi / omega)}" if relative else ""
+        return _with_unit(number(2 * math.pi / omega) + spread, self._time("omega", "rad/"))
+
+    def per_time(self, name: str) -> str:
+        """`per s`, of a rate in `1/s`."""
+        return f"per {self._time(name, '1/') or 'unit of time'}"
+
+    def _time(self, name: str, start: str) -> str | None:
+        """The unit of time that stands below a fraction bar."""
+        unit = self.units.get(name) or ""
+        return unit.removeprefix(start) if unit.startswith(start) else None
+
+
+def consequence(said: Said) -> str:
+    """One sentence on what the effect does."""
+    return _DOES[said.one.effect.name](said)
+
+
+def _stiffens(said: Said) -> str:
+    way = "pulls back and raises" if said.mean("k") > 0 else "pushes away and lowers"
+    return f"It {way} the frequency at every amplitude; no energy is lost."
+
+
+def _uneven(said: Said) -> str:
+    stiffer, softer = ("positive", "negative") if said.mean("k") > 0 else ("negative", "positive")
+    q = said.one.targets[0]
+    return f"It makes the motion uneven: stiffer towards {stiffer} {q}, softer towards {softer}; it takes no energy."
+
+
+def _hardens(said: Said) -> str:
+    way = "rises" if said.mean("k") > 0 else "falls"
+    return f"The frequency {way} with the amplitude; no energy is lost."
+
+
+def _excites(said: Said) -> str:
+    inside, outside = ("feeds energy in", "takes it out") if said.mean("c") > 0 else ("takes energy out", "feeds it in")
+    a, q = said.plain("a"), said.one.targets[0]
+    return f"It {inside} while {q} stays within a = {a} and {outside} beyond, on either side."
+
+
+def _bends_orbits(said: Said) -> str:
+    way = "attracts" if said.mean("b") > 0 else "repels"
+    return f"It {way}, strongly at small r alone, so orbits precess; it changes neither energy nor angular momentum."
+
+
+def _couples(said: Said) -> str:
+    q, q2, way = *said.one.targets, "raises" if said.mean("k") > 0 else "lowers"
+    return (
+        f"It {way} the frequency at which {q} and {q2} move against each other, lets energy pass between them, "
+        "and leaves their common motion alone."
+    )
+
+
+def _stops(said: Said) -> str:
+    side = "below" if said.one.side == "lower" else "above"
+    q, a = said.one.targets[0], _with_unit(number(said.mean("a")), said.units.get("a"))
+    return f"It acts only while {q} is {side} {a}, and gives back the energy it takes."
+
+
+def _pushes(said: Said) -> str:
+    return (
+        f"It repeats with a period of {said.period} and pumps energy in and out; its amplitude is {said.plain('a')} "
+        "whatever the motion does."
+    )
+
+
+def _strikes(said: Said) -> str:
+    way = "up" if said.mean("j") > 0 else "down"
+    return (
+        f"The momentum jumps {way} by {said.plain('j')} at t = {said.value('t_star')}; before and after "
+        "that, it adds nothing."
+    )
+
+
+def _swings(said: Said) -> str:
+    return f"It swings by {said.percent('a')} to either side, with a period of {said.period}."
+
+
+def _creeps(said: Said) -> str:
+    way = "grows" if said.mean("r") > 0 else "falls"
+    return f"It {way} by {said.percent('r')} {said.per_time('r')} of its value at the first row."
+
+
+def _switches(said: Said) -> str:
+    way = "higher" if said.mean("d") > 0 else "lower"
+    return f"From t = {said.value('t_star')} on it is {said.percent('d')} {way} than before."
+
+
+def _exchanges(said: Said) -> str:
+    return (
+        f"Its own period is {said.period}; energy that {said.one.targets[0]} loses to it comes back, "
+        "and none is lost in all."
+    )
+
+
+def _corrects(said: Said) -> str:
+    way = "higher" if said.mean("d") > 0 else "lower"
+    return f"It should be {said.percent('d')} {way} than given; the form of the equations stays as it is."
+
+
+def _scatters(said: Said) -> str:
+    way = "larger" if said.mean("s") > 1 else "smaller"
+    size = number(100 * abs(said.mean("s") - 1))
+    return f"The noise is {size} % {way} than given; {_ALONE}"
+
+
+def _offsets(said: Said) -> str:
+    way = "high" if said.mean("b") > 0 else "low"
+    return f"It reads {said.plain('b')} too {way} throughout; {_ALONE}"
+
+
+def _scales(said: Said) -> str:
+    way = "large" if said.mean("g") > 0 else "small"
+    return f"It shows everything {said.percent('g')} too {way}; {_ALONE}"
+
+
+def _wanders(said: Said) -> str:
+    unit, way = said.units.get("r"), "up" if said.mean("r") > 0 else "down"
+    rate = number(abs(said.mean("r"))) + (f" {unit}" if unit else " per unit of time")
+    return f"It creeps {way} by {rate}, counted from the first row; {_ALONE}"
+
+
+def _lags(said: Said) -> str:
+    unit = said.units.get("tau") or "units of time"
+    return f"It shows what was {number(said.mean('tau'))} {unit} before; {_ALONE}"
+
+
+def _errs(said: Said) -> str:
+    return (
+        f"{said.percent('e')} of the readings are off, by errors with a standard deviation of {said.value('sd')}; "
+        f"{_ALONE}"
+    )
+
+
+def _same(text: str) -> Callable[[Said], str]:
+    return lambda said: text.format(q=said.one.targets[0], q2=said.one.targets[-1])
+
+
+_ALONE = "the motion itself is not touched."
+_DOES: dict[str, Callable[[Said], str]] = {
+    "viscous_damping": _same("It takes out energy at the rate c v^2, so a free swing decays exponentially."),
+    "quadratic_drag": _same("It takes out energy at the rate c |v|^3: far more of large swings than of small ones."),
+    "coulomb_friction": lambda said: (
+        "It takes out energy at the rate f |v|: a free swing loses about the same amplitude every time, and the motion "
+        f"sticks where the other forces stay below {said.plain('f')}."
+    ),
+    "relative_damping": _same("It takes out energy where {q} and {q2} move apart or together; common motion is free."),
+    "self_excitation": _excites,
+    "constant_force": lambda said: (
+        f"It always pushes towards {'positive' if said.mean('f') > 0 else 'negative'} {said.one.targets[0]}, so that a "
+        "point of rest moves that way; no energy is lost."
+    ),
+    "linear_stiffness": _stiffens,
+    "quadratic_stiffness": _uneven,
+    "cubic_stiffness": _hardens,
+    "coupling_spring": _couples,
+    "contact_stop": _stops,
+    "central_correction": _bends_orbits,
+    "gyroscopic_coupling": _same("It turns motion along {q} into motion along {q2} and back, and does no work."),
+    "periodic_forcing": _pushes,
+    "impulse": _strikes,
+    "parametric_modulation": _swings,
+    "parameter_drift": _creeps,
+    "regime_change": _switches,
+    "hidden_oscillator": _exchanges,
+    "parameter_error": _corrects,
+    "sensor_noise": _scatters,
+    "sensor_bias": _offsets,
+    "sensor_gain": _scales,
+    "sensor_drift": _wanders,
+    "sensor_delay": _lags,
+    "sensor_outliers": _errs,
+    "unnamed_force": _same("Its form was fitted to the missing force and holds where the motion has been, not beyond."),
+}
+
+
+def _with_unit(text: str, unit: str | None) -> str:
+    return f"{text} {unit}" if unit else text

@@ -1,0 +1,161 @@
+"""Priors of every effect's values: the same strength for every effect, along the motion that was recorded."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from .. import _effects as effects
+from .._effects import Candidate, Drag, Oscillating, PowerForce
+from ._along import along_all, force, readings, velocity
+from ._calibrate import Priors
+from ._problem import Problem
+from ._unnamed import Proposal
+
+# Prior scale of an effect: its force against the forces already there, its error against the reading's spread, its
+# change of a parameter against the parameter.
+STRENGTH = 0.3
+# A stop bears the forces already there at this share of the motion's range, or softer.
+_DEPTH = 0.005
+# A delay is a few samples at most.
+_SAMPLES = 5.0
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square of the finite values; 1 where there is none, or none but zeros."""
+    square = values[np.isfinite(values)] ** 2
+    mean = float(np.sqrt(square.mean())) if square.size else 1.0
+    return mean if np.isfinite(mean) and mean > 0 else 1.0
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The motion that was recorded, as the simulation without effects follows it; rows of all recordings."""
+
+    q: Float[np.ndarray, "row d"]
+    v: Float[np.ndarray, "row d"]
+    forces: Float[np.ndarray, " d"]  # root mean square
+    spreads: Float[np.ndarray, " channel"]  # standard deviation of the expected readings
+    first: float
+    last: float
+    gap: float  # median time between rows
+
+    @property
+    def span(self) -> float:
+        return self.last - self.first
+
+    @property
+    def frequencies(self) -> tuple[float, float]:
+        """From half a cycle in the recording to half the Nyquist frequency, in rad/time."""
+        return np.pi / self.span, max(np.pi / (2 * self.gap), 2 * np.pi / self.span)
+
+    def own_frequency(self, i: int) -> float:
+        """Typical frequency of one coordinate's motion, in rad/time."""
+        return rms(self.v[:, i]) / rms(self.q[:, i] - np.nanmean(self.q[:, i]))
+
+
+def motion_along(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarray, "_ state"]]) -> Motion:
+    """The motion along given paths."""
+    d = problem.equations.dim
+    v, push, shown = (along_all(problem, what, z, paths) for what in (velocity, force, readings))
+    times = [r.times[: len(path)] for r, path in zip(problem.rows, paths, strict=True)]
+    return Motion(
+        q=np.concatenate([path[:, :d] for path in paths]),
+        v=v[:, :d],
+        forces=np.array([rms(push[:, i]) for i in range(d)]),
+        spreads=np.array([max(float(np.nanstd(column)), 1e-300) for column in shown.T]),
+        first=min(float(t[0]) for t in times),
+        last=max(float(t[-1]) for t in times),
+        gap=float(np.median(np.concatenate([np.diff(t) for t in times]))),
+    )
+
+
+def with_effects(problem: Problem, priors: Priors, motion: Motion) -> Priors:
+    """Priors with those of every effect's values filled in."""
+    centres, scales, lower, upper = (a.copy() for a in (priors.centres, priors.scales, priors.lower, priors.upper))
+    for one in problem.equations.candidates:
+        amplitudes = slice(one.first, one.first + one.effect.amplitudes)
+        scales[amplitudes] = STRENGTH * np.array(_unit(motion, one))
+        if one.effect is effects.DELAY:
+            upper[one.first] = _SAMPLES * motion.gap
+        if one.effect.places:
+            place = amplitudes.stop
+            low, high = _range(motion, one)
+            centres[place], scales[place] = (low + high) / 2, (high - low) / np.sqrt(12)
+            lower[place], upper[place] = low, high
+    scales = np.where(np.isfinite(scales) & (scales > 0), scales, 1.0)
+    i = int(np.argmax(motion.forces))
+    push = STRENGTH * motion.forces[i]
+    unseen = np.array([push, push * motion.own_frequency(i)])
+    return replace(priors, centres=centres, scales=scales, lower=lower, upper=upper, unseen=unseen)
+
+
+def _unit(motion: Motion, one: Candidate) -> tuple[float, ...]:
+    """Amplitudes as strong as what is already there."""
+    if one.effect.acts_on == effects.COLUMN:
+        spread = motion.spreads[one.place]
+        units = {effects.BIAS: spread, effects.GAIN: 1.0, effects.DRIFT: spread / motion.span}
+        return (units.get(one.effect, _SAMPLES / 2 * motion.gap / STRENGTH),) * one.effect.amplitudes
+    if one.effect.acts_on == effects.PARAMETER:
+        return (1.0 / motion.span if one.effect is effects.DRIFTING else 1.0,) * one.effect.amplitudes
+    return _pair_unit(motion, one) if one.effect.acts_on == effects.PAIR else _force_unit(motion, one)
+
+
+def _force_unit(motion: Motion, one: Candidate) -> tuple[float, ...]:
+    i = one.place
+    q, v, push = motion.q[:, i], motion.v[:, i], motion.forces[i]
+    if isinstance(one.effect, PowerForce):
+        return (push / rms(q**one.effect.power),)
+    if isinstance(one.effect, Drag):
+        return (push / rms(np.abs(v) ** one.effect.power),)
+    if one.effect is effects.EXCITATION:
+        return push / rms(v), push / rms(q**2 * v)
+    if one.effect is effects.STOP:
+        return (push / (_DEPTH * max(np.ptp(q), 1e-300)),)
+    if one.effect is effects.HIDDEN:
+        return (push * motion.own_frequency(i) ** 2 / rms(q),)
+    if one.terms:
+        return (1.0,) * len(one.terms)  # see `with_unnamed`
+    if one.effect is effects.IMPULSE:
+        return (push / motion.own_frequency(i),)
+    return (push / np.sqrt(2),) * 2  # a cosine and a sine
+
+
+def _pair_unit(motion: Motion, one: Candidate) -> tuple[float, ...]:
+    i, j = one.places
+    push = min(motion.forces[i], motion.forces[j])
+    if one.effect is effects.RELATIVE:
+        return (push / rms(motion.v[:, i] - motion.v[:, j]),)
+    if one.effect is effects.SPRING:
+        return (push / rms(motion.q[:, i] - motion.q[:, j]),)
+    if one.effect is effects.GYROSCOPIC:
+        return (push / max(rms(motion.v[:, i]), rms(motion.v[:, j])),)
+    r = np.hypot(motion.q[:, i], motion.q[:, j])
+    return (push / rms(3 * motion.q[:, i] / np.maximum(r, 0.1 * rms(r)) ** 5),)
+
+
+def _range(motion: Motion, one: Candidate) -> tuple[float, float]:
+    """Where an effect's place may lie."""
+    if isinstance(one.effect, Oscillating) or one.effect is effects.HIDDEN:
+        return motion.frequencies
+    if one.effect is effects.STOP:
+        low, middle, high = np.nanquantile(motion.q[:, one.place], [0.0, 0.5, 1.0])
+        return (float(middle), float(high)) if one.side == "upper" else (float(low), float(middle))
+    return motion.first, motion.last
+
+
+def with_unnamed(
+    problem: Problem, priors: Priors, listed: Sequence[Proposal], members: Sequence[int], forces: np.ndarray
+) -> Priors:
+    """Priors with those of forces without a name: as strong as every other effect. `forces` as in `Motion`."""
+    grown = {}
+    for name, fill in (("centres", 0.0), ("scales", 1.0), ("lower", -np.inf), ("upper", np.inf)):
+        values = np.full(problem.equations.size, fill)
+        old = getattr(priors, name)
+        values[: len(old)] = old
+        grown[name] = values
+    for member, one in zip(members, listed, strict=True):
+        values = STRENGTH * forces[one.coordinate] / np.array(one.spreads)
+        grown["scales"][problem.candidate(member).values] = values
+    return replace(priors, **grown)

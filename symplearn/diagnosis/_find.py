@@ -1,0 +1,88 @@
+"""From files to everything that was weighed: the problem laid out finely enough, searched, and searched again where
+no name fits."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .._effects import UNNAMED
+from .._recording import Recording
+from .._simulation_records import SimulationFile
+from ._build import augmented_equations, build, first_substep, refined, rows_fitted
+from ._found import Found
+from ._locate import strained_coordinates
+from ._options import Options
+from ._outlook import Outlook
+from ._posterior import CONSISTENT, Posterior, posterior
+from ._problem import MOST, Problem
+from ._search import Search
+from ._start import first_fits, priors_without_effects
+from ._trajectory import Stepper
+from ._unnamed import proposals
+
+# A remainder is clear that stands this many nats above white noise.
+_CLEAR = 5.0
+
+
+def searched(
+    file: SimulationFile, recordings: Sequence[Recording], options: Options, deadline: float
+) -> tuple[Found, Stepper]:
+    """Lay the problem out with substeps that are fine enough, and search; once more where what is found needs finer."""
+    first, middle = float(recordings[0].times[0]), float(np.mean(recordings[0].times[[0, -1]]))
+    built = augmented_equations(file, first, options.restriction, middle)
+    substep = first_substep(file, recordings)
+
+    def rebuild(longest: float) -> Problem:
+        return build(file, built, recordings, options.holdout, longest, options.restriction)
+
+    problem = rebuild(substep)
+    stepper = Stepper(problem, options.jobs)
+    options.progress("finding where the motion starts")
+    seeds = first_fits(stepper, priors_without_effects(problem), rows_fitted(problem.rows))
+    finer, substep = refined(rebuild, problem, seeds.z[0], seeds.noise[0], substep)
+    stepper = stepper if finer is problem else Stepper(finer, options.jobs)
+    search = Search(stepper, seeds.z[0], deadline, options.progress)
+    found = search.run()
+    best = max((e for es in found.estimates.values() for e in es), key=lambda e: e.log_evidence)
+    if np.isfinite(best.log_evidence):
+        finer, _ = refined(rebuild, finer, best.z, best.noise, substep, best.combination)
+        if finer is not stepper.problem:
+            options.progress("weighing the best combinations again in finer steps")
+            found = search.again(Stepper(finer, options.jobs))
+    return _with_unnamed(file, recordings, options, search, found)
+
+
+def _with_unnamed(
+    file: SimulationFile, recordings: Sequence[Recording], options: Options, search: Search, found: Found
+) -> tuple[Found, Stepper]:
+    """Where no name fits, weigh an expression that was fitted to the missing force."""
+    stepper = search.stepper
+    pull = found.of(search.base, "force")
+    if pull is None or pull.intensity is None or not options.restriction.has(UNNAMED):
+        return found, stepper
+    if not _is_open(posterior(stepper.problem, found, 1.0), found):
+        return found, stepper
+    options.progress("looking for an expression of the missing force")
+    outlooks = [Outlook(stepper, pull, r, pull.intensity) for r in range(len(recordings))]
+    if not all(o.ok for o in outlooks):
+        return found, stepper
+    listed = proposals(file, outlooks, strained_coordinates(outlooks))
+    if not listed:
+        return found, stepper
+    first, middle = float(recordings[0].times[0]), float(np.mean(recordings[0].times[[0, -1]]))
+    built = augmented_equations(file, first, options.restriction, middle, {p.coordinate: p.terms for p in listed})
+    longest = float(np.max(stepper.problem.rows[0].spans.step)) * (1 + 1e-9)
+    problem = build(file, built, recordings, options.holdout, longest, options.restriction)
+    return search.with_unnamed(Stepper(problem, options.jobs), listed), search.stepper
+
+
+def _is_open(odds: Posterior, found: Found) -> bool:
+    """Whether no name fits, or the best ones are many or leave a clear remainder beside them."""
+    if odds.as_it_is >= CONSISTENT:
+        return False
+    if not odds.named or odds.unexplained >= odds.named[0].probability:
+        return True
+    best = odds.named[0].best
+    white = found.of(best.combination, "white")
+    clear = white is None or best.log_evidence > white.log_evidence + _CLEAR
+    return len(best.combination) == MOST or clear

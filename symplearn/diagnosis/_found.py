@@ -1,0 +1,67 @@
+"""Everything that was weighed, by combination and kind of remainder."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.special import logsumexp
+
+from ._calibrate import Priors
+from ._problem import Combination, Problem
+from ._weighed import Estimate, Mode
+
+# Two optima whose places differ by more than this many standard deviations are two modes.
+_APART = 2.0
+
+
+@dataclass
+class Found:
+    """Estimates by combination, one per kind of remainder; where the places of its effects have several optima, they
+    are its modes."""
+
+    problem: Problem
+    priors: Priors
+    estimates: dict[Combination, list[Estimate]] = field(default_factory=dict)
+    complete: bool = True
+    choices: dict[int, float] = field(default_factory=dict)  # log of how many expressions a force was chosen from
+
+    def add(self, estimate: Estimate) -> None:
+        """Keep an estimate beside those of the same combination and kind, as a mode where it stands apart."""
+        kinds = self.estimates.setdefault(estimate.combination, [])
+        old = self.of(estimate.combination, estimate.kind)
+        if old is None:
+            kinds.append(replace(estimate, modes=(Mode(estimate.log_evidence, estimate.z, estimate.covariance),)))
+            return
+        kinds[kinds.index(old)] = self._joined(old, estimate)
+
+    def _joined(self, old: Estimate, new: Estimate) -> Estimate:
+        """The better of two estimates, with the modes of both; its evidence is that of all modes together."""
+        modes = list(old.modes)
+        one = Mode(new.log_evidence, new.z, new.covariance)
+        same = [k for k, mode in enumerate(modes) if not self._apart(old.combination, mode, one)]
+        if same:
+            best = max([one, *(modes[k] for k in same)], key=lambda mode: mode.log_evidence)
+            modes = [mode for k, mode in enumerate(modes) if k not in same] + [best]
+        elif np.isfinite(one.log_evidence):
+            modes.append(one)
+        top = max(mode.log_evidence for mode in modes)
+        better = new if one.log_evidence >= max(mode.log_evidence for mode in old.modes) else old
+        total = float(logsumexp([mode.log_evidence for mode in modes])) if np.isfinite(top) else -np.inf
+        return replace(better, log_evidence=total, modes=tuple(modes))
+
+    def _apart(self, combination: Combination, a: Mode, b: Mode) -> bool:
+        """Whether some effect has its place elsewhere."""
+        for member, place in self.problem.placed(combination):
+            if self.problem.candidate(member).effect.places:
+                k = place.stop - 1
+                sd = np.sqrt(max(a.covariance[k, k], b.covariance[k, k]))
+                if abs(a.z[k] - b.z[k]) > _APART * sd:
+                    return True
+        return False
+
+    def of(self, combination: Combination, kind: str) -> Estimate | None:
+        """The estimate of a combination under one kind of remainder, None where there is none."""
+        return next((e for e in self.estimates.get(combination, []) if e.kind == kind), None)
+
+    def best(self, combination: Combination) -> float:
+        """The largest log evidence of a combination over kinds."""
+        return max((e.log_evidence for e in self.estimates[combination]), default=-np.inf)

@@ -1,0 +1,266 @@
+"""Where a further effect would help: scores on a grid of places, without a refit.
+
+An effect's amplitudes enter in proportion, so their response at zero tells how much they would gain once the other
+unknowns follow (the score test of Rao 1948, nuisance projected out). A frequency, a time or a threshold has no slope at
+amplitude zero, so it is tried on a grid; the best places are where fits begin.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+
+import numpy as np
+from jaxtyping import Float
+
+from .. import _effects as effects
+from .._effects import Candidate, Oscillating
+from ._calibrate import Fits, Priors, residuals, weights
+from ._noisy import PathFit, lane_grams
+from ._problem import SLOTS, Combination, Problem
+from ._trajectory import DIRECTIONS, LANES, Stepper
+
+# Places tried for times and thresholds, and the most frequencies; frequencies this many times pi over the span apart.
+_TIMES, _THRESHOLDS, _FREQUENCIES, _SPACING = 60, 12, 160, 0.8
+# Starts kept for each effect and target, and for each choice of recordings.
+_BEST = 3
+
+
+@dataclass(frozen=True)
+class Unit:
+    """An effect on a target at one place."""
+
+    candidate: int
+    place: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a fit of a combination begins, and the log evidence that it is expected to gain."""
+
+    combination: Combination
+    z: Float[np.ndarray, " z"]
+    gain: float
+
+
+def grid(problem: Problem, priors: Priors, candidate: int) -> list[Unit]:
+    """The places that are tried for an effect on a target."""
+    one = problem.equations.candidates[candidate]
+    if not one.effect.places:
+        return [Unit(candidate, None)] if one.effect.amplitudes else []
+    low, high = priors.lower[one.values.stop - 1], priors.upper[one.values.stop - 1]
+    return [Unit(candidate, float(place)) for place in _places(one, low, high)]
+
+
+def _places(one: Candidate, low: float, high: float) -> np.ndarray:
+    if isinstance(one.effect, Oscillating) or one.effect is effects.HIDDEN:
+        number = int(min(_FREQUENCIES, np.ceil((high - low) / (_SPACING * low))))
+        # Evenly spaced as far as they go, which is what the span resolves; then ever wider.
+        even = np.linspace(low, high, number)
+        return even if high - low <= _SPACING * low * _FREQUENCIES else np.geomspace(low, high, number)
+    number = _THRESHOLDS if one.effect is effects.STOP else _TIMES
+    return low + (high - low) * (np.arange(number) + 0.5) / number
+
+
+def spacing(one: Candidate, low: float, high: float) -> float:
+    """About how far apart neighbouring places are."""
+    if isinstance(one.effect, Oscillating) or one.effect is effects.HIDDEN:
+        return _SPACING * low
+    return (high - low) / (_THRESHOLDS if one.effect is effects.STOP else _TIMES)
+
+
+def packed(problem: Problem, units: Sequence[Unit]) -> Iterator[list[Unit]]:
+    """Units that can be looked at together: each target once, one unseen oscillator, no more values than slots."""
+    by_candidate: dict[int, list[Unit]] = {}
+    for unit in units:
+        by_candidate.setdefault(unit.candidate, []).append(unit)
+    for group in zip_longest(*by_candidate.values()):
+        lane: list[Unit] = []
+        for unit in (unit for unit in group if unit is not None):
+            if not _fits(problem, lane, unit):
+                yield lane
+                lane = []
+            lane.append(unit)
+        yield lane
+
+
+def _fits(problem: Problem, lane: list[Unit], unit: Unit) -> bool:
+    ones = [problem.equations.candidates[u.candidate] for u in (*lane, unit)]
+    unseen = sum(one.effect is effects.HIDDEN for one in ones)
+    directions = sum(one.effect.amplitudes for one in ones) + 2 * unseen
+    size = sum(one.effect.size for one in ones)
+    once = unit.candidate not in {u.candidate for u in lane}
+    return once and size <= SLOTS and directions <= DIRECTIONS and unseen <= 1
+
+
+def layout(problem: Problem, lane: Sequence[Unit]) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Values of the slots, their coefficients (as `Problem.onehot`), and the slots of each unit's amplitudes."""
+    values, matrix, amplitudes = np.zeros(SLOTS), np.zeros((SLOTS + 1, problem.equations.size)), []
+    first = 0
+    for unit in lane:
+        one = problem.equations.candidates[unit.candidate]
+        rows = np.arange(first, first + one.effect.size)
+        matrix[rows, np.arange(one.values.start, one.values.stop)] = 1.0
+        if one.effect.switched:
+            matrix[-1, one.values.stop] = 1.0
+        if unit.place is not None:
+            values[rows[-1]] = unit.place
+        amplitudes.append(rows[: one.effect.amplitudes])
+        first += one.effect.size
+    return values, matrix, amplitudes
+
+
+# Gram matrices by recording of the columns [1, x_0, calibrated, amplitudes] of every unit of some lanes.
+Grams = Callable[[Sequence[Sequence[Unit]]], list[list[list[np.ndarray]]]]
+
+
+def on_trajectory(stepper: Stepper, fits: Fits, lane: int, rows: Sequence[int]) -> Grams:
+    """Grams about a fitted trajectory: the response of every reading to an amplitude."""
+    problem, combination = stepper.problem, fits.combinations[lane]
+    weight = weights(problem, rows)
+    r = residuals(problem, fits.predictions, weight)
+    nuisance = problem.state + problem.calibrated.size
+
+    def of(lanes: Sequence[Sequence[Unit]]) -> list[list[list[np.ndarray]]]:
+        laid = [layout(problem, units) for units in lanes]
+        found: list[list[list[np.ndarray]]] = [[[] for _ in units] for units in lanes]
+        for k, w in enumerate(weight):
+            root = np.where(w > 0, np.sqrt(w), 0.0) / fits.noise[lane]
+            known = fits.predictions[k].slopes[lane, :nuisance]
+            slopes = stepper.responses(fits.z[lane], combination, laid, rows[k], k)
+            for b, (units, (_, _, amplitudes)) in enumerate(zip(lanes, laid, strict=True)):
+                for u, unit in enumerate(units):
+                    own = known
+                    if problem.equations.candidates[unit.candidate].effect is effects.HIDDEN:
+                        own = known.copy()
+                        own[_unseen(problem)] = slopes[b][_unseen(problem)]
+                    further = slopes[b][nuisance + amplitudes[u]]
+                    columns = np.concatenate([r[k][lane][None], own, further]) * root
+                    flat = np.nan_to_num(columns.reshape(len(columns), -1))
+                    found[b][u].append(flat @ flat.T)
+        return found
+
+    return of
+
+
+def on_path(stepper: Stepper, fit: PathFit, rows: Sequence[int]) -> Grams:
+    """Grams about a path with a missing force: innovations, which follow the recording however far it has gone."""
+    problem = stepper.problem
+    nuisance = 1 + problem.state + problem.calibrated.size
+
+    def of(lanes: Sequence[Sequence[Unit]]) -> list[list[list[np.ndarray]]]:
+        laid = [layout(problem, units) for units in lanes]
+        found: list[list[list[np.ndarray]]] = [[[] for _ in units] for units in lanes]
+        for k in range(len(rows)):
+            grams = lane_grams(stepper, fit, [(values, matrix) for values, matrix, _ in laid], rows, k)
+            for b, (units, (_, _, amplitudes)) in enumerate(zip(lanes, laid, strict=True)):
+                for u in range(len(units)):
+                    some = np.concatenate([np.arange(nuisance), nuisance + amplitudes[u]])
+                    found[b][u].append(grams[b][np.ix_(some, some)])
+        return found
+
+    return of
+
+
+def _unseen(problem: Problem) -> np.ndarray:
+    width = problem.equations.width
+    return np.array([width - 1, 2 * width - 1])
+
+
+def scan(
+    problem: Problem, grams: Grams, z: Float[np.ndarray, " z"], combination: Combination, priors: Priors,
+    units: Sequence[Unit],
+) -> list[Start]:  # fmt: skip
+    """Starts of `combination` with one further effect each, the best places of every effect and target."""
+    lanes = list(packed(problem, units))
+    found: dict[int, list[tuple[float, Start]]] = {}
+    for a in range(0, len(lanes), LANES):
+        some = lanes[a : a + LANES]
+        for group, by_unit in zip(some, grams(some), strict=True):
+            for unit, by_recording in zip(group, by_unit, strict=True):
+                for member in _members(problem, unit, combination):
+                    start = _scored(problem, by_recording, z, combination, priors, unit, member)
+                    if start is not None:
+                        found.setdefault(member, []).append((0.0 if unit.place is None else unit.place, start))
+    return [start for listed in found.values() for start in _peaks(listed)]
+
+
+def _members(problem: Problem, unit: Unit, combination: Combination) -> list[int]:
+    """The effect and target in all recordings, or in some; a jump at one time is in one recording."""
+    single = problem.equations.candidates[unit.candidate].effect is effects.IMPULSE
+    members = [unit.candidate, *problem.variants(unit.candidate)]
+    if single and len(problem.rows) > 1:
+        members = [m for m in members if len(problem.members[m].recordings) == 1]
+    return [m for m in members if problem.is_possible((*combination, m))]
+
+
+def _scored(
+    problem: Problem, by_recording: Sequence[np.ndarray], z, combination: Combination, priors: Priors, unit: Unit,
+    member: int,
+) -> Start | None:  # fmt: skip
+    """The step that a unit's amplitudes and everything else would take, and what it gains."""
+    one, n = problem.candidate(member), problem.slots
+    size = 1 + n + one.effect.amplitudes
+    gram = np.zeros((size, size))
+    for r, own in enumerate(by_recording):
+        place = np.concatenate(
+            [[0], 1 + problem.local(r)[: problem.state + problem.calibrated.size], np.arange(1 + n, size)]
+        )
+        present = np.ones(len(place))
+        if r not in problem.members[member].recordings:
+            present[-one.effect.amplitudes :] = 0.0
+        gram[np.ix_(place, place)] += own * np.outer(present, present)
+    larger = tuple(sorted((*combination, member)))
+    active = problem.active((member,))[:n]
+    precision = priors.precision_of(problem, (member,))[:n]
+    scales = priors.scales[one.first : one.first + one.effect.amplitudes]
+    a = np.concatenate([np.nonzero(active)[0], n + np.arange(len(scales))])
+    matrix = gram[1:, 1:][np.ix_(a, a)] + np.diag(np.concatenate([precision[active], scales**-2.0]))
+    vector = gram[0, 1:][a]
+    vector[: active.sum()] -= (precision * (z - priors.mean_of(problem, combination))[:n])[active]
+    k = int(active.sum())
+    before = _solved(matrix[:k, :k], vector[:k])
+    after = _solved(matrix, vector)
+    if before is None or after is None:
+        return None
+    gain = after[1] - before[1] - np.log(scales).sum()
+    step = after[0]
+    amplitudes = step[k:]
+    if one.effect.positive and amplitudes[0] < 0:
+        return None
+    begin = z.copy()
+    begin[:n][active] += step[:k]
+    begin[n:] = 0.0
+    return Start(larger, _placed(problem, z, begin, combination, larger, member, amplitudes, unit), float(gain))
+
+
+def _placed(problem, z, begin, combination, larger, member, amplitudes, unit: Unit) -> np.ndarray:
+    """Values of the old effects where they are, and of the new one where the step puts them."""
+    old = dict(problem.placed(combination))
+    for m, place in problem.placed(larger):
+        if m == member:
+            begin[place] = np.append(amplitudes, [] if unit.place is None else [unit.place])
+        else:
+            begin[place] = z[old[m]]
+    return begin
+
+
+def _solved(matrix: np.ndarray, vector: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """Newton's step, and half of what it takes off less half the log determinant."""
+    if not (np.isfinite(matrix).all() and np.isfinite(vector).all()):
+        return None
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    values = np.maximum(values, 1e-13)
+    along = vectors.T @ (vector / scale)
+    step = vectors @ (along / values) / scale
+    return step, float(0.5 * (along**2 / values).sum() - 0.5 * np.log(values).sum() - np.log(scale).sum())
+
+
+def _peaks(listed: list[tuple[float, Start]]) -> list[Start]:
+    """The best places that are no neighbours of a better one."""
+    listed = sorted(listed, key=lambda pair: pair[0])
+    gains = np.array([start.gain for _, start in listed])
+    padded = np.concatenate([[-np.inf], gains, [-np.inf]])
+    peak = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
+    ranked = sorted(np.nonzero(peak)[0], key=lambda k: -gains[k])
+    return [listed[k][1] for k in ranked[:_BEST]]

@@ -1,0 +1,121 @@
+"""How readings scatter: noise that is heavier-tailed than a Gaussian, noise that is wrongly given, and outliers."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.special import gammaln
+from scipy.stats import norm
+
+from .._effects import NOISE, OUTLIERS
+from ._problem import Combination, Problem
+
+# Degrees of freedom of the heavy-tailed noise that is weighed beside the Gaussian.
+_FREEDOM = 5.0
+# Prior of a wrongly given noise: standard deviation of the logarithm of its factor.
+_FACTOR = 1.0
+# Priors of outliers: their share is below this one, and the logarithm of their size has this standard deviation.
+_SHARE, _SIZE = 0.2, 1.5
+# A reading is suspected where it lies this many robust standard deviations off; Student's t of 5 degrees of freedom
+# sends one in a thousand there.
+_SUSPECT = 6.0
+_ROUNDS = 50
+
+
+def law_gain(
+    problem: Problem, combination: Combination, errors: Float[np.ndarray, "row channel"],
+    noise: Float[np.ndarray, " channel"],
+) -> float:  # fmt: skip
+    """Log evidence gained by leaving open whether the noise is Gaussian or Student's, each half likely beforehand.
+
+    `errors` are standardised by `noise`, NaN where there is none. A heavy tail is the sensor's own, no mismatch.
+    """
+    known, total = problem.noise_of(combination), 0.0
+    for j in range(errors.shape[1]):
+        e = errors[~np.isnan(errors[:, j]), j]
+        if len(e):
+            gain = _student(e, bool(np.isnan(known[j]))) + 0.5 * float((e**2).sum()) + 0.5 * len(e) * np.log(2 * np.pi)
+            total += float(np.logaddexp(0.0, gain) - np.log(2.0))
+    return total
+
+
+def _student(e: np.ndarray, free: bool) -> float:
+    """Log likelihood of Student's t, its scale the best one where it is free, else that of unit variance."""
+    f = _FREEDOM
+    square = (f - 2) / f
+    for _ in range(30 if free else 0):
+        square = float(np.mean((f + 1) / (f + e**2 / square) * e**2))
+        square = max(square, 1e-300)
+    constant = gammaln((f + 1) / 2) - gammaln(f / 2) - 0.5 * np.log(f * np.pi * square)
+    return float(len(e) * constant - 0.5 * (f + 1) * np.log1p(e**2 / (f * square)).sum())
+
+
+def factor_evidence(
+    problem: Problem, combination: Combination, noise: Float[np.ndarray, " channel"], number: np.ndarray
+) -> float:
+    """What a wrongly given noise owes for the choice of its factor: prior times the width of the likelihood."""
+    total = 0.0
+    for member in combination:
+        one = problem.candidate(member)
+        if one.effect is NOISE:
+            factor = np.log(noise[one.place] / problem.noise[one.place])
+            total += norm.logpdf(factor, scale=_FACTOR) + 0.5 * np.log(np.pi / max(number[one.place], 1.0))
+    return float(total)
+
+
+def suspects(
+    errors: Sequence[Float[np.ndarray, "_ channel"]],
+) -> list[Bool[np.ndarray, "_ channel"]]:
+    """Readings that lie far off, by recording; at most the share that the prior of outliers allows."""
+    joined = np.concatenate(errors)
+    out = []
+    with np.errstate(invalid="ignore"):
+        middle = np.nanmedian(joined, axis=0)
+        spread = 1.4826 * np.nanmedian(np.abs(joined - middle), axis=0)
+        far = np.abs(joined - middle) > _SUSPECT * np.maximum(spread, 1e-300)
+    far &= far.mean(0) < _SHARE
+    ends = np.cumsum([len(e) for e in errors])[:-1]
+    out = np.split(far, ends)
+    return out
+
+
+def outlier_evidence(
+    combination: Combination,
+    problem: Problem,
+    errors: Float[np.ndarray, "row channel"],
+    flagged: Bool[np.ndarray, "row channel"],
+) -> float:
+    """Log evidence of the suspected readings as outliers, of a share and a size integrated over their priors."""
+    total = 0.0
+    for member in combination:
+        one = problem.candidate(member)
+        if one.effect is OUTLIERS:
+            n, far = int((~np.isnan(errors[:, one.place])).sum()), int(flagged[:, one.place].sum())
+            if far == 0:
+                return -np.inf
+            share = min(far / n, _SHARE)
+            off = errors[flagged[:, one.place], one.place]
+            size = float(np.sqrt(np.mean(off**2)))
+            total += far * np.log(share) + (n - far) * np.log1p(-share) + norm.logpdf(off, scale=size).sum()
+            total += 0.5 * np.log(2 * np.pi * share * (1 - share) / n) - np.log(_SHARE)
+            total += 0.5 * np.log(np.pi / far) + norm.logpdf(0.0, scale=_SIZE)
+    return float(total)
+
+
+def outliers(errors: Float[np.ndarray, " row"], flagged: Bool[np.ndarray, " row"]) -> tuple[float, float]:
+    """Share of the readings that are outliers, and their standard deviation in that of the noise.
+
+    By expectation and maximisation from the flagged ones, since the smallest outliers hide among the noise.
+    """
+    seen = ~np.isnan(errors)
+    e, off = errors[seen], flagged[seen]
+    if not off.any():
+        return 0.0, 0.0
+    share, size = float(off.mean()), float(np.sqrt(np.mean(e[off] ** 2)))
+    for _ in range(_ROUNDS):
+        odds = share * norm.pdf(e, scale=np.hypot(size, 1.0))
+        belongs = odds / np.maximum(odds + (1 - share) * norm.pdf(e), 1e-300)
+        belongs[off] = 1.0
+        share = float(belongs.mean())
+        size = float(np.sqrt(max((belongs * e**2).sum() / belongs.sum() - 1.0, 1.0)))
+    return share, size

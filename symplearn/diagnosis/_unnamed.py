@@ -1,0 +1,132 @@
+"""A missing force that no name fits: a sparse expression in position, velocity and inputs, kept where it is stable."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import numpy as np
+import sympy
+from jaxtyping import Float
+
+from .._expression import Expression
+from .._kinks import Absolute, Sign
+from .._simulation_records import SimulationFile
+from .._symbolic import derivative, numpy_function
+from ._outlook import Outlook
+
+# Highest degree of the monomials, and the most terms of an expression.
+_DEGREE, _TERMS = 3, 3
+# Stretches the recording is cut into, halves of them that are drawn, and in what share of them a term must be chosen.
+_STRETCHES, _HALVES, _STABLE = 12, 24, 0.7
+# A term is taken up while it lowers the unexplained variance by this share at least.
+_GAIN = 0.03
+# An expression that explains less of the smoothed missing force than this is not worth a fit.
+_EXPLAINED = 0.2
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A force on one coordinate: its terms in the simulation's own names, what each is multiplied by, and how large
+    each is along the motion (root mean square)."""
+
+    coordinate: int
+    terms: tuple[sympy.Expr, ...]
+    sizes: tuple[float, ...]
+    spreads: tuple[float, ...]
+    choices: float  # log of how many such expressions the library holds
+
+
+def proposals(file: SimulationFile, outlooks: Sequence[Outlook], coordinates: Sequence[int]) -> list[Proposal]:
+    """A stable expression for the missing force on each of some coordinates, where there is one.
+
+    `outlooks` hold the missing force of the simulation without effects, by recording.
+    """
+    terms = library(file)
+    problem, d = outlooks[0].stepper.problem, len(file.coordinates)
+    columns, force = [], []
+    for o in outlooks:
+        n, width = o.rows.fitted, problem.equations.width
+        means = np.asarray(o.smoothed.means[:n])
+        path = np.concatenate([means[:, :d], means[:, width : width + d]], axis=1)
+        fixed = problem.parameter_values(o.recording, o.estimate.z)[: len(file.parameters)]
+        columns.append(along_path(file, terms, fixed, path, o.rows.inputs[:n], o.rows.times[:n]))
+        force.append(o.missing_force())
+    values, push, out = np.concatenate(columns), np.concatenate(force), []
+    for i in coordinates:
+        chosen, sizes, explained = stable_terms(values, push[:, i])
+        if chosen and explained > _EXPLAINED:
+            spreads = tuple(float(x) for x in np.sqrt((values[:, chosen] ** 2).mean(0)))
+            choices = float(np.log(math.comb(len(terms), len(chosen))))
+            some = tuple(terms[k] for k in chosen)
+            out.append(Proposal(i, some, tuple(float(x) for x in sizes), spreads, choices))
+    return out
+
+
+def written(terms: Sequence[sympy.Expr], sizes: Iterable[float]) -> Expression:
+    """The force as an expression of the simulation's names."""
+    tree = sympy.Add(*(sympy.Float(float(f"{size:.6g}"), 8) * term for term, size in zip(terms, sizes, strict=True)))
+    return Expression(str(tree), tree)
+
+
+def library(file: SimulationFile) -> list[sympy.Expr]:
+    """Products of coordinates and velocities up to a degree, |v| v and sign(v), inputs, and inputs times those."""
+    states = file.symbols
+    v = [derivative(file.hamiltonian.tree, states[p]) for p in file.momenta]
+    letters = [states[q] for q in file.coordinates] + v
+    out: list[sympy.Expr] = [sympy.Integer(1)]
+    for degree in range(1, _DEGREE + 1):
+        if degree == _DEGREE and len(letters) > 4:
+            break
+        out += [sympy.Mul(*chosen) for chosen in combinations_with_replacement(letters, degree)]
+    out += [form for one in v for form in (Absolute(one) * one, Sign(one))]
+    inputs = [states[u] for u in file.recording.inputs]
+    return out + inputs + [u * letter for u in inputs for letter in letters]
+
+
+def along_path(
+    file: SimulationFile, terms: Sequence[sympy.Expr], parameters: np.ndarray, path: np.ndarray, inputs: np.ndarray,
+    times: np.ndarray,
+) -> Float[np.ndarray, "row term"]:  # fmt: skip
+    """Values of terms along a path (row, 2d) of phase points."""
+    names = [*file.states, *file.parameters, *file.recording.inputs, "t"]
+    function = numpy_function(list(terms), [file.symbols[name] for name in names])
+    fixed = np.broadcast_to(parameters[:, None], (len(parameters), len(path)))
+    with np.errstate(all="ignore"):
+        return np.asarray(function(np.concatenate([path.T, fixed, inputs.T, times[None]]))).T
+
+
+def stable_terms(
+    columns: Float[np.ndarray, "row term"], force: Float[np.ndarray, " row"]
+) -> tuple[list[int], np.ndarray, float]:
+    """Terms that are chosen in most halves of the rows, their coefficients, and the share of the force explained."""
+    scale = np.sqrt((columns**2).mean(0))
+    usable = np.isfinite(scale) & (scale > 0)
+    scaled = np.where(usable, columns / np.where(usable, scale, 1.0), 0.0)
+    rng, number = np.random.default_rng(0), np.zeros(columns.shape[1])
+    stretch = np.minimum(np.arange(len(force)) * _STRETCHES // len(force), _STRETCHES - 1)
+    for _ in range(_HALVES):
+        half = np.isin(stretch, rng.choice(_STRETCHES, _STRETCHES // 2, replace=False))
+        number[_forward(scaled[half], force[half])] += 1
+    chosen = [int(k) for k in np.argsort(-number) if number[k] >= _STABLE * _HALVES][:_TERMS]
+    if not chosen:
+        return [], np.zeros(0), 0.0
+    sizes = np.linalg.lstsq(scaled[:, chosen], force, rcond=None)[0]
+    left = force - scaled[:, chosen] @ sizes
+    return chosen, sizes / scale[chosen], 1.0 - float((left**2).sum() / max((force**2).sum(), 1e-300))
+
+
+def _forward(columns: np.ndarray, force: np.ndarray) -> list[int]:
+    """Forward selection: the term that explains most, then the next one beside it."""
+    chosen: list[int] = []
+    total = left = float((force**2).sum())
+    for _ in range(_TERMS):
+        losses = np.full(columns.shape[1], np.inf)
+        for k in set(range(columns.shape[1])) - set(chosen):
+            some = columns[:, [*chosen, k]]
+            losses[k] = ((force - some @ np.linalg.lstsq(some, force, rcond=None)[0]) ** 2).sum()
+        best = int(np.argmin(losses))
+        if left - losses[best] < _GAIN * total:
+            break
+        chosen, left = [*chosen, best], float(losses[best])
+    return chosen

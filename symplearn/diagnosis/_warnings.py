@@ -1,0 +1,53 @@
+"""What a reader of a diagnosis must be told."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .._recording import Recording
+from ._found import Found
+from ._outlook import Outlook
+from ._posterior import Posterior
+from ._problem import Problem
+from ._weighed import Estimate
+
+
+def warnings(
+    problem: Problem,
+    recordings: Sequence[Recording],
+    found: Found,
+    odds: Posterior,
+    after: Estimate,
+    without: Sequence[Outlook],
+    with_: Sequence[Outlook],
+) -> list[str]:
+    """What is wrong or to be borne in mind, a sentence each."""
+    out, c = [], problem.calibrated
+    shortened = [r for r, whole in zip(problem.rows, recordings, strict=True)
+                 if r.times[0] > whole.times[0] and r.counts.max() <= 1]  # fmt: skip
+    for r in shortened:
+        out.append(f"only the last {r.fitted} rows before the held-out part were fitted, of {r.given} in all: "
+                   "they are too many, and too sparse for the motion to be averaged")  # fmt: skip
+    if any(r.counts.max() > 1 for r in problem.rows):
+        given, used = sum(r.given for r in problem.rows), sum(r.used for r in problem.rows)
+        out.append(f"the rows were averaged from {given} to {used}: "
+                   "they are sampled far above the motion's frequencies")  # fmt: skip
+    if not after.converged:
+        out.append("the fit did not converge; its numbers are not to be relied on")
+    if not all(np.isfinite(o.readings).all() for o in (*without, *with_)):
+        out.append("the simulated trajectory diverges: it leaves every bound before the recording ends")
+    if not all(o.ok for o in (*without, *with_)):
+        out.append("a filter step failed: the trajectory diverges from the recording, or is not finite")
+    if not found.complete:
+        out.append("the time limit was reached before every combination was weighed")
+    for j, name in enumerate(c.names):
+        moved = abs(after.z[problem.head + j] - c.mean[j]) / c.sd[j]
+        if moved > 3:
+            out.append(f"{name} moved {moved:.1f} of its prior standard deviations to fit the recording")
+    if after.combination and after.kind != "white":
+        kind = "an error of the sensor" if after.kind == "coloured" else "a small missing force"
+        out.append(f"a remainder without a name is left beside the findings: {kind}")
+    if odds.tempered < 1:
+        out.append(f"evidence was discounted by a factor of {1 / odds.tempered:.1f}: "
+                   "the remainder is not white on the scale of the motion")  # fmt: skip
+    return out

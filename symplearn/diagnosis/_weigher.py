@@ -1,0 +1,176 @@
+"""Fitting and weighing combinations under every remainder, with outliers taken out where there are some."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from .._effects import OUTLIERS, STOP
+from ._along import along, readings
+from ._calibrate import Fits, grow, residuals, weights
+from ._found import Found
+from ._noisy import PathFit
+from ._problem import MOST, Combination, Problem
+from ._scan import Start
+from ._scatter import outlier_evidence, outliers, suspects
+from ._start import windows
+from ._trajectory import Stepper
+from ._weighed import Estimate, standardised, weigh_coloured, weigh_white
+
+# A window grows in these steps, so that a trajectory fit is not caught in a local minimum.
+_GROWTH = (0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.0)
+# Substeps over all rows beyond which the search is narrowed before the whole recording is used, and to how many.
+_AFFORDABLE = 12_000
+KEPT = 8
+
+
+class Weigher:
+    """Fits and weighs combinations of effects on given recordings, and keeps what it found.
+
+    `base` are the outliers that were taken out beforehand: every combination holds them.
+    """
+
+    def __init__(self, stepper: Stepper, found: Found):
+        self.plain = self.stepper = stepper
+        self.found = found
+        self.rows = [r.fitted for r in stepper.problem.rows]
+        self.base: Combination = ()
+        self.owed: dict[Combination, float] = {}  # log evidence of the readings that were taken out
+        self.flagged = [np.zeros_like(r.readings, bool) for r in stepper.problem.rows]
+
+    @property
+    def problem(self) -> Problem:
+        return self.stepper.problem
+
+    def moved_to(self, stepper: Stepper, found: Found) -> None:
+        """Go on with another stepper of the same recordings."""
+        self.plain = self.stepper = stepper
+        if any(bad.any() for bad in self.flagged):
+            self.stepper = stepper.on(stepper.problem.without(self.flagged))
+        self.found = found
+
+    def take_out_outliers(self, fit: PathFit) -> bool:
+        """Leave readings out that lie far off a path; whether there are any."""
+        columns = {self.problem.candidate(m).place: m for m in self.problem.searched
+                   if self.problem.candidate(m).effect is OUTLIERS}  # fmt: skip
+        far = suspects([self._path_errors(fit, r) for r in range(len(self.rows))])
+        may = [j in columns or j in self.problem.known_outliers for j in range(self.problem.channels)]
+        for r, bad in enumerate(far):
+            self.flagged[r][: len(bad)] |= bad & np.array(may)
+        if not any(bad.any() for bad in self.flagged):
+            return False
+        self.stepper = self.plain.on(self.plain.problem.without(self.flagged))
+        some = np.any([bad.any(0) for bad in self.flagged], axis=0)
+        self.base = tuple(sorted(m for j, m in columns.items() if some[j]))[: MOST - 1]
+        return True
+
+    def _path_errors(self, fit: PathFit, r: int) -> np.ndarray:
+        """Readings less those on a path, by their noise; NaN where nothing was read."""
+        rows = self.plain.problem.rows[r]
+        shown = along(self.problem, readings, r, fit.z, (), fit.paths[r])
+        counts = rows.counts[: len(shown)]
+        return np.where(counts > 0, np.sqrt(counts) * (rows.readings[: len(shown)] - shown) / fit.noise, np.nan)
+
+    def weigh(self, starts: Sequence[Start], whole: bool = False) -> None:
+        """Fit and weigh combinations; on a long recording most are dropped after its first part.
+
+        With `whole`, all rows are fitted at once: the starts are good already.
+        """
+        z, candidates = np.stack([start.z for start in starts]), [start.combination for start in starts]
+        held = np.array([self._is_held(one) for one in starts])
+        growing = self._windows()[-1:] if whole else self._windows()
+        cut = len(growing) if whole else self._first_part(growing)
+        priors = self.found.priors
+        if cut < len(growing) and len(candidates) > KEPT:
+            fits = grow(self.stepper, z, candidates, priors, growing[:cut], final=20, held=held)
+            values = [e.log_evidence for e in weigh_white(self.problem, fits, priors, growing[cut - 1])]
+            kept = [int(k) for k in np.argsort(values)[::-1]][:KEPT]
+            z, candidates, held, growing = fits.z[kept], [candidates[k] for k in kept], held[kept], growing[cut:]
+        fits = grow(self.stepper, z, candidates, priors, growing, held=held)
+        for b, estimate in enumerate(weigh_white(self.problem, fits, priors, self.rows)):
+            self._add(estimate, *self._outliers(fits, b))
+        for estimate in weigh_coloured(self.problem, fits, priors, self.rows):
+            white = self.found.of(estimate.combination, "white")
+            self._add(estimate, self.owed[estimate.combination], white.outliers if white else ())
+
+    def _add(self, estimate: Estimate, value: float, told: tuple[tuple[float, float], ...]) -> None:
+        self.owed[estimate.combination] = value
+        self.found.add(replace(estimate, log_evidence=estimate.log_evidence + value, outliers=told))
+
+    def _is_held(self, start: Start) -> bool:
+        """Whether effects keep their values in early windows, which say nothing of a late jump or a slow beat."""
+        ones = [self.problem.candidate(m).effect for m in start.combination]
+        return bool(np.any(start.z[self.problem.slots :])) and any(one.places and one is not STOP for one in ones)
+
+    def _outliers(self, fits: Fits, lane: int) -> tuple[float, tuple[tuple[float, float], ...]]:
+        """What outliers that were taken out owe, and their share and size by channel."""
+        if not self.base:
+            return 0.0, ()
+        weight = weights(self.plain.problem, self.rows)
+        r = residuals(self.plain.problem, fits.predictions, weight)
+        errors = standardised([x[lane] for x in r], weight, fits.noise[lane])
+        flagged = np.concatenate([bad[:n] for bad, n in zip(self.flagged, self.rows, strict=True)])
+        told = [outliers(errors[:, j], flagged[:, j]) for j in range(self.problem.channels)]
+        value = outlier_evidence(self.base, self.problem, errors, flagged)
+        number = flagged.sum(0)
+        value -= float((number * np.log(fits.noise[lane])).sum())  # densities in the readings' own unit
+        return value, tuple((share, size * float(s)) for (share, size), s in zip(told, fits.noise[lane], strict=True))
+
+    def weigh_with_outliers_in(self) -> None:
+        """The best combinations again with no reading taken out."""
+        if not self.base:
+            return
+        ranked = sorted(self.found.estimates, key=self.found.best, reverse=True)[:KEPT]
+        starts = {}
+        for c in dict.fromkeys([self.base, *ranked]):
+            white = self.found.of(c, "white")
+            less = tuple(m for m in c if m not in self.base)
+            if white is not None:
+                starts[less] = Start(less, white.z, 0.0)
+        clean, base = self.stepper, self.base
+        self.stepper, self.base = self.plain, ()
+        self.weigh(list(starts.values()), whole=True)
+        self.stepper, self.base = clean, base
+
+    def add_paths(self, fits: Sequence[PathFit]) -> None:
+        """Of the intensities tried for each combination, the best, owing for the choice."""
+        for combination in dict.fromkeys(fit.combination for fit in fits):
+            mine = [fit for fit in fits if fit.combination == combination]
+            values = np.array([fit.log_evidence for fit in mine])
+            if not np.isfinite(values).any():
+                continue
+            best = mine[int(np.argmax(values))]
+            assert best.laplace is not None  # its evidence is finite
+            mean = values.max() + np.log(np.mean(np.exp(values - values.max())))
+            white = self.found.of(combination, "white")
+            self.found.add(
+                Estimate(
+                    combination,
+                    "force",
+                    best.z,
+                    best.laplace.covariance,
+                    best.noise,
+                    float(mean) + self.owed.get(combination, 0.0),
+                    best.converged,
+                    intensity=best.intensity,
+                    paths=best.paths,
+                    outliers=white.outliers if white else (),
+                )  # fmt: skip
+            )
+
+    @property
+    def is_long(self) -> bool:
+        """Whether the recordings are too long for every combination to see all of them."""
+        return self._first_part(self._windows()) < len(_GROWTH)
+
+    @property
+    def path_steps(self) -> int:
+        return 8 if self.is_long else 16
+
+    def _windows(self) -> list[list[int]]:
+        return windows(self.rows, _GROWTH, max(8, 4 * self.problem.state))
+
+    def _first_part(self, growing: list[list[int]]) -> int:
+        """How many of the growing windows are affordable for every combination."""
+        pieces = self.problem.rows[0].spans.inputs.shape[1]
+        return max(1, sum(sum(rows) * pieces <= _AFFORDABLE for rows in growing))

@@ -1,0 +1,65 @@
+"""What a fit holds inside and the contract's coefficients are the same thing said twice."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from symplearn._effects import EFFECTS, Oscillating
+
+AMOUNT = st.floats(1e-3, 1e3)
+FREQUENCY = st.floats(1e-2, 1e2)
+PHASE = st.floats(-math.pi, math.pi, exclude_min=True)
+ORIGIN = st.floats(-50.0, 50.0)
+OSCILLATING = [e for e in EFFECTS.values() if isinstance(e, Oscillating)]
+# Products of frequency and origin reach 5000 radians, whose last digit is 1e-12.
+ROUND_OFF = 1e-11
+
+
+def back(effect, values, origin):
+    """The contract's coefficients of the values inside, each of a batch of one."""
+    return {name: float(v[0]) for name, v in effect.named(effect.inner(values, origin)[None], origin).items()}
+
+
+@pytest.mark.parametrize("effect", OSCILLATING, ids=lambda e: e.name)
+@given(a=AMOUNT, omega=FREQUENCY, phi=PHASE, origin=ORIGIN)
+def test_oscillations_come_back(effect, a, omega, phi, origin):
+    """Amplitude, frequency and phase, wherever phases inside count from; the phase lies in (-pi, pi]."""
+    found = back(effect, {"a": a, "omega": omega, "phi": phi}, origin)
+    assert found["a"] == pytest.approx(a, rel=ROUND_OFF) and found["omega"] == omega
+    assert -math.pi < found["phi"] <= math.pi
+    assert abs(math.remainder(found["phi"] - phi, 2 * math.pi)) < ROUND_OFF
+
+
+@given(cosine=st.floats(-5, 5), sine=st.floats(-5, 5), omega=st.floats(-50, 50), origin=ORIGIN, t=st.floats(-50, 50))
+def test_any_values_inside_are_the_same_oscillation(cosine, sine, omega, origin, t):
+    """A negative frequency too: a cos(omega t + phi) is what the values inside say, with a and omega positive."""
+    found = {name: float(v[0]) for name, v in
+             EFFECTS["periodic_forcing"].named(np.array([[cosine, sine, omega]]), origin).items()}  # fmt: skip
+    assert found["a"] >= 0 and found["omega"] >= 0 and -math.pi < found["phi"] <= math.pi
+    inside = cosine * math.cos(omega * (t - origin)) + sine * math.sin(omega * (t - origin))
+    if omega != 0:  # a constant has no phase
+        assert found["a"] * math.cos(found["omega"] * t + found["phi"]) == pytest.approx(inside, abs=1e-10)
+
+
+@given(c=AMOUNT, a=AMOUNT, omega=FREQUENCY, kappa=AMOUNT)
+def test_self_excitation_and_hidden_oscillators_come_back(c, a, omega, kappa):
+    """c and a, omega and kappa."""
+    for name, values in (
+        ("self_excitation", {"c": c, "a": a}),
+        ("hidden_oscillator", {"omega": omega, "kappa": kappa}),
+    ):
+        assert back(EFFECTS[name], values, 0.0) == pytest.approx(values, rel=ROUND_OFF)
+
+
+@pytest.mark.parametrize("effect", [e for e in EFFECTS.values() if e.amplitudes], ids=lambda e: e.name)
+def test_one_set_of_values_or_many(effect):
+    """Values inside may be one vector, as a fit has them, or many, as draws are."""
+    values = {name: 0.7 for name in effect.coefficients}
+    inside = effect.inner(values, 0.3)
+    assert len(inside) == effect.size
+    one, many = effect.named(inside, 0.3), effect.named(np.tile(inside, (3, 1)), 0.3)
+    for name in effect.coefficients:
+        assert float(one[name]) == pytest.approx(0.7) and many[name] == pytest.approx([0.7] * 3)

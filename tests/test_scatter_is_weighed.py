@@ -1,0 +1,150 @@
+"""How readings scatter is weighed as its integrals say: heavy tails, a wrongly given noise, outliers."""
+
+import engine_cases as cases
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.optimize import minimize_scalar
+from scipy.special import logsumexp
+from scipy.stats import norm, t
+
+from symplearn.diagnosis._scatter import factor_evidence, law_gain, outlier_evidence, outliers, suspects
+
+GIVEN = 0.1  # noise of the first column; that of the second is estimated
+
+
+@pytest.fixture(scope="module")
+def problem():
+    file = cases.simulation("p**2/2 + q**2/2", observe={"a": "q", "b": "p"}, more=f"[recording.noise]\na = {GIVEN}")
+    return cases.problem(file, [cases.recorded(np.arange(10.0), np.ones((10, 2)))], 1.0)
+
+
+def member(problem, effect, column=0):
+    return next(m for m in problem.searched
+                if problem.candidate(m).effect.name == effect and problem.candidate(m).place == column)  # fmt: skip
+
+
+def alone(e, column):
+    """Errors of one column, the other without readings."""
+    out = np.full((len(e), 2), np.nan)
+    out[:, column] = e
+    return out
+
+
+DRAWS = {"gaussian": lambda rng, n: rng.normal(size=n), "student": lambda rng, n: rng.standard_t(5, n) * np.sqrt(0.6)}
+
+
+@pytest.mark.parametrize("draw", DRAWS.values(), ids=DRAWS)
+def test_the_law_of_a_given_noise_is_a_mixture_of_two(problem, draw):
+    """Beside a noise that is given, Student's t of unit variance and the Gaussian are each half likely."""
+    e = draw(np.random.default_rng(0), 200)
+    logs = [norm.logpdf(e).sum(), t.logpdf(e, 5, scale=np.sqrt(0.6)).sum()]
+    expected = logsumexp(logs) - np.log(2) - logs[0]
+    found = law_gain(problem, (), alone(e, 0), np.array([GIVEN, 1.0]))
+    assert found == pytest.approx(expected, abs=1e-9)  # round-off of 200 logarithms
+
+
+@pytest.mark.parametrize("draw", DRAWS.values(), ids=DRAWS)
+def test_the_law_of_an_estimated_noise_has_its_own_best_scale(problem, draw):
+    """Where the noise is estimated, each law has the scale that is best for it, found here by search."""
+    e = draw(np.random.default_rng(1), 200)
+    e /= np.sqrt((e**2).mean())  # the Gaussian's best scale, by which errors are standardised
+    best = minimize_scalar(lambda s: -t.logpdf(e, 5, scale=np.exp(s)).sum(), bounds=(-2, 1), method="bounded",
+                           options={"xatol": 1e-8})  # fmt: skip
+    gain = -best.fun - norm.logpdf(e).sum()
+    found = law_gain(problem, (), alone(e, 1), np.array([GIVEN, 1.0]))
+    # Thirty steps of its iteration leave less than 1e-6 of the scale.
+    assert found == pytest.approx(np.logaddexp(0.0, gain) - np.log(2), abs=1e-6)
+
+
+def test_columns_are_weighed_apart_and_no_reading_says_nothing(problem):
+    """The gain of two columns is the sum of each one's; a column without readings has none."""
+    rng = np.random.default_rng(2)
+    both = rng.standard_t(3, size=(100, 2))
+    noise = np.array([GIVEN, 1.0])
+    apart = sum(law_gain(problem, (), alone(both[:, j], j), noise) for j in range(2))
+    assert law_gain(problem, (), both, noise) == pytest.approx(apart)
+    assert law_gain(problem, (), np.full((5, 2), np.nan), noise) == 0.0
+
+
+def test_a_tail_that_is_heavy_is_worth_its_evidence_and_a_light_one_costs_a_bit(problem):
+    """Gaussian readings lose at most log 2; readings of Student's t gain many nats."""
+    noise, rng = np.array([GIVEN, 1.0]), np.random.default_rng(3)
+    assert -np.log(2) <= law_gain(problem, (), alone(rng.normal(size=2000), 0), noise) < 0
+    assert law_gain(problem, (), alone(DRAWS["student"](rng, 2000), 0), noise) > 20
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 3.0])
+def test_a_wrong_noise_owes_what_its_integral_says(problem, factor):
+    """Likelihood at the best factor times what it owes is the integral over factors, their logarithm N(0, 1)."""
+    r = factor * GIVEN * np.random.default_rng(4).normal(size=120)
+    best = np.sqrt((r**2).mean())
+    top = norm.logpdf(r, scale=best).sum()
+    integral = quad(lambda s: np.exp(norm.logpdf(r, scale=GIVEN * np.exp(s)).sum() - top + norm.logpdf(s)),
+                    np.log(best / GIVEN) - 1, np.log(best / GIVEN) + 1, epsabs=0, epsrel=1e-10)[0]  # fmt: skip
+    chosen = (member(problem, "sensor_noise"),)
+    found = factor_evidence(problem, chosen, np.array([best, 1.0]), np.array([120, 50]))
+    # Laplace's error is of order 1 / readings.
+    assert found == pytest.approx(np.log(integral), abs=0.02)
+    assert factor_evidence(problem, (), np.array([best, 1.0]), np.array([120, 50])) == 0.0
+
+
+def contaminated(seed, number=400, share=0.06, size=12.0):
+    """Standardised errors of two columns, some of the first column's off by far more than the noise."""
+    rng = np.random.default_rng(seed)
+    e = rng.normal(size=(number, 2))
+    off = rng.random(number) < share
+    e[off, 0] += np.sign(rng.normal(size=off.sum())) * size * (1 + rng.random(off.sum()))
+    return e, off
+
+
+def test_what_lies_far_off_is_suspected():
+    """Every outlier of 12 to 24 standard deviations, in its own recording, and nothing else."""
+    e, off = contaminated(5)
+    parts = suspects([e[:150], e[150:]])
+    assert [len(part) for part in parts] == [150, 250]
+    found = np.concatenate(parts)
+    np.testing.assert_array_equal(found[:, 0], off)
+    assert not found[:, 1].any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gaussian_readings_are_not_suspected(seed):
+    """None of ten thousand, missing ones among them: six standard deviations are passed once in 5e8."""
+    e = np.random.default_rng(seed).normal(size=(10_000, 1))
+    e[::7] = np.nan
+    assert not suspects([e])[0].any()
+
+
+def test_what_most_readings_do_is_no_outlier():
+    """A share beyond the prior's is the sensor's own way, and nothing of it is taken out."""
+    e, _ = contaminated(6, share=0.3)
+    assert not suspects([e])[0].any()
+
+
+@pytest.mark.parametrize("share", [0.03, 0.1])
+def test_outliers_owe_what_their_integral_says(problem, share):
+    """The suspected readings' evidence is the integral over their share, even below 0.2, and over their size, whose
+    logarithm is within 1.5 of what was found."""
+    e, off = contaminated(7, share=share)
+    flagged = np.stack([off, np.zeros_like(off)], 1)
+    n, far = len(e), int(off.sum())
+    found_share, size = outliers(e[:, 0], off)
+    top = far * np.log(found_share) + (n - far) * np.log1p(-found_share)
+    shares = quad(lambda s: np.exp(far * np.log(s) + (n - far) * np.log1p(-s) - top) / 0.2, 1e-6, 0.2,
+                  epsabs=0, epsrel=1e-9, points=[found_share])[0]  # fmt: skip
+    logs = norm.logpdf(e[off, 0], scale=size).sum()
+    sizes = quad(lambda s: np.exp(norm.logpdf(e[off, 0], scale=size * np.exp(s)).sum() - logs + norm.logpdf(s, 0, 1.5)),
+                 -3, 3, epsabs=0, epsrel=1e-9, points=[0.0])[0]  # fmt: skip
+    expected = top + np.log(shares) + logs + np.log(sizes)
+    found = outlier_evidence((member(problem, "sensor_outliers"),), problem, e, flagged)
+    # Laplace's error is of order 1 / outliers, of which there are a dozen at least.
+    assert far >= 10 and found == pytest.approx(expected, abs=1.0 / far)
+
+
+def test_outliers_that_are_not_there_have_no_evidence(problem):
+    """Nothing suspected: the effect is impossible, and without the effect nothing is owed."""
+    e = np.random.default_rng(8).normal(size=(100, 2))
+    none = np.zeros((100, 2), bool)
+    assert outlier_evidence((member(problem, "sensor_outliers"),), problem, e, none) == -np.inf
+    assert outlier_evidence((), problem, e, none) == 0.0
