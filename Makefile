@@ -1,5 +1,5 @@
 .POSIX:
-.PHONY: help demo test test-slow test-recordings test-oracles agreement lock clean
+.PHONY: help demo test test-slow test-recordings test-oracles agreement proof concealed gallery lock clean
 
 VENV = .venv
 LOCK = requirements.lock
@@ -30,6 +30,15 @@ test-oracles: ## agreement with other packages, in an environment of its own (.v
 
 agreement: $(VENV)/project.stamp
 	$(VENV)/bin/pytest tests/oracles
+
+proof: ## diagnose 120 concealed cases beside today's practice (hours; it goes on where it was stopped; OPTIONS=--quick)
+	@$(MAKE) -s VENV=.venv-oracles LOCK=requirements-oracles.lock concealed
+
+concealed: $(VENV)/project.stamp
+	$(VENV)/bin/python -m experiments.concealed $(OPTIONS)
+
+gallery: $(VENV)/project.stamp ## the pages of docs/gallery, from the real recordings; a run that was stopped goes on
+	$(PYTHON) -m experiments.gallery
 
 # Two stamps: a new lock makes the environment anew, a new pyproject.toml only installs the project again.
 # A stamp is the last thing written, so an interrupted run starts over.
