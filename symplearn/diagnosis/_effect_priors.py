@@ -18,6 +18,8 @@ from ._unnamed import Proposal
 STRENGTH = 0.3
 # A stop bears the forces already there at this share of the motion's range, or softer.
 _DEPTH = 0.005
+# Root mean square over the recording of what grows evenly to one, and of what is one in half of it: their inverses.
+_EVEN, _HALF = np.sqrt(3.0), np.sqrt(2.0)
 # A delay is a few samples at most.
 _SAMPLES = 5.0
 
@@ -95,10 +97,11 @@ def _unit(motion: Motion, one: Candidate) -> tuple[float, ...]:
     """Amplitudes as strong as what is already there."""
     if one.effect.acts_on == effects.COLUMN:
         spread = motion.spreads[one.place]
-        units = {effects.BIAS: spread, effects.GAIN: 1.0, effects.DRIFT: spread / motion.span}
+        units = {effects.BIAS: spread, effects.GAIN: 1.0, effects.DRIFT: _EVEN * spread / motion.span}
         return (units.get(one.effect, _SAMPLES / 2 * motion.gap / STRENGTH),) * one.effect.amplitudes
     if one.effect.acts_on == effects.PARAMETER:
-        return (1.0 / motion.span if one.effect is effects.DRIFTING else 1.0,) * one.effect.amplitudes
+        later = {effects.DRIFTING: _EVEN / motion.span, effects.REGIME: _HALF}
+        return (later.get(one.effect, 1.0),) * one.effect.amplitudes
     return _pair_unit(motion, one) if one.effect.acts_on == effects.PAIR else _force_unit(motion, one)
 
 
@@ -119,7 +122,7 @@ def _force_unit(motion: Motion, one: Candidate) -> tuple[float, ...]:
         return (1.0,) * len(one.terms)  # see `with_unnamed`
     if one.effect is effects.IMPULSE:
         return (push / motion.own_frequency(i),)
-    return (push / np.sqrt(2),) * 2  # a cosine and a sine
+    return (push,) * 2  # a cosine and a sine, whose root mean squares add in squares
 
 
 def _pair_unit(motion: Motion, one: Candidate) -> tuple[float, ...]:

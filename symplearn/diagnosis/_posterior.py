@@ -16,6 +16,8 @@ _UNINFORMED = 0.7
 _UNCONVERGED = 3.0
 # The simulation counts as consistent unless the probability of nothing left out is below this (contract).
 CONSISTENT = 0.05
+# Prior share of a change in time that begins anew in every one of several recordings.
+_ANEW = 1.0 / 30.0
 # Kinds of remainder other than white noise; each combination divides its remainder's prior among them.
 _REMAINDERS = ("coloured", "force")
 
@@ -116,8 +118,20 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
 
 
 def _share(problem: Problem, member: int) -> float:
-    """Of an effect and target's prior, half goes to all recordings and the rest to the choices among them."""
-    variants = len(problem.variants(member))
-    if problem.candidate(member).effect is IMPULSE:
+    """Of an effect and target's prior, half goes to all recordings and the rest to the choices among them.
+
+    Little of it where a change in time would have to begin anew in every recording, as their clocks do.
+    """
+    variants, one = len(problem.variants(member)), problem.candidate(member)
+    if one.effect is IMPULSE:
         return 1.0 / len(problem.rows)
-    return 1.0 if variants == 0 else (0.5 if member == problem.whole(member) else 0.5 / variants)
+    if variants == 0:
+        return 1.0
+    every = _ANEW if one.effect.family == "time variation" and _clocks_overlap(problem) else 0.5
+    return every if member == problem.whole(member) else (1.0 - every) / variants
+
+
+def _clocks_overlap(problem: Problem) -> bool:
+    """Whether two recordings claim the same time."""
+    spans = sorted((float(r.times[0]), float(r.times[-1])) for r in problem.rows)
+    return any(later[0] < earlier[1] for earlier, later in zip(spans[:-1], spans[1:], strict=True))

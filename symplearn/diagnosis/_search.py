@@ -22,7 +22,9 @@ from ._weigher import KEPT, Weigher
 # Combinations of one size are carried on to the next size while within this many nats of the best.
 _REACH = 30.0
 # Combinations that are extended, most larger ones that are fitted, and what a larger one must gain to go on.
-_BASES, _PAIRS, _WORTH = 5, 40, 2.0
+_BASES, _PAIRS, _WORTH = 4, 24, 2.0
+# Combinations that a missing force is tried beside.
+_FORCED = 6
 # Combinations that are fitted between two looks at the clock.
 _BATCH = 24
 # Combinations whose places are moved, how near they are to the best; and those that are weighed again in finer steps.
@@ -162,7 +164,7 @@ class Search:
         low, high = priors.lower[one.values.stop - 1], priors.upper[one.values.stop - 1]
         step = spacing(one, low, high)
         out = []
-        for k in (-4, -3, -2, -1, 1, 2, 3, 4):
+        for k in (-3, -1, 1, 3):
             if low < z[entry] + k * step < high:
                 out.append(z.copy())
                 out[-1][entry] += k * step
@@ -279,8 +281,7 @@ class Search:
     def _weigh_forces(self) -> None:
         """Best combinations again, each with a missing force beside it."""
         named = sorted((c for c in self.found.estimates if self._size(c)), key=self.found.best, reverse=True)
-        long = self.weigher.is_long
-        self._add_forces(named[: KEPT // 2 if long else KEPT], 2 if long else 1)
+        self._add_forces(named[: KEPT // 2 if self.weigher.is_long else _FORCED], 2)
 
     def _add_forces(self, combinations: Sequence[Combination], every: int) -> None:
         starts = []

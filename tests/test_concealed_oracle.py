@@ -1,0 +1,152 @@
+"""The oracle fits what nature moved, ranks rivals rightly, and the table of equivalences holds by computation."""
+
+import numpy as np
+import pytest
+
+from experiments import _concealed_hiding, _concealed_rivals
+from experiments._concealed_drawing import Public, Wish, _records
+from experiments._concealed_effects import Effect
+from experiments._concealed_equivalent import equivalent, swallowed
+from experiments._concealed_files import answer, recording_file
+from experiments._concealed_fit import Free, Given, fit
+from experiments._concealed_hiding import Claim, clean_readings, form_of, starts, weights
+from experiments._concealed_nature import Case
+from experiments._concealed_oracle import asked, consulted
+from experiments._concealed_plan import Plan
+from experiments._concealed_planes import ZOO
+from experiments._concealed_rivals import nuisances, responses
+from experiments._concealed_sensors import Setup, expected, moved
+
+NOTHING = Claim(0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+def setting(name, columns=None, rows=120, noise=0.02, **wish):
+    """A setup of a system with the noise a part of one, and all parameters known."""
+    system, rng = ZOO[name], np.random.default_rng(0)
+    values = system.draw(rng)
+    records = tuple(
+        r._replace(times=r.times[:rows], forecast=r.forecast[:10])
+        for r in _records(rng, system, values, Wish(name, **wish), 1)
+    )
+    readings = tuple(r for r in system.readings if (r.kind == "position" if columns is None else r.column in columns))
+    setup = Setup(system, values, readings, {r.column: noise for r in readings}, "gaussian", 5.0, records)
+    return setup, Public((), {}, {}, ((),) * len(records))
+
+
+def case_of(setup, public, *effects):
+    """A case with these effects and Gaussian noise."""
+    rng, clean, after = np.random.default_rng(1), [], []
+    for record in setup.records:
+        motion = moved(setup, record, effects)
+        clean.append(expected(setup, record, effects, motion, record.times))
+        after.append(expected(setup, record, effects, motion, record.forecast))
+    noisy = [c + weights(setup) * rng.normal(size=c.shape) for c in clean]
+    item = Plan(1, not effects, "open", "", False, "")
+    return Case(item, setup, public, effects, (), 0.0, tuple(noisy), tuple(clean), tuple(after), NOTHING, 1)
+
+
+def test_a_fit_of_the_true_form_finds_the_truth():
+    """From wrong values, least squares comes back to the coefficient and the calibrated parameter without noise."""
+    setup, public = setting("duffing")
+    public = public._replace(free=(Free("k", setup.values["k"] * 1.01, None),))
+    true = Effect("viscous_damping", "q", {"c": 0.05})
+    form = form_of(setup, public, (true,), ((0, "c"),))
+    given = Given(clean_readings(setup, (true,)), weights(setup))
+    theta = form.begin(starts(setup))
+    found = fit(form, given, theta * np.array([1.01, 0.5, 1.0, 1.0]), form.scales(theta))
+    assert found.theta == pytest.approx(theta, rel=1e-3, abs=1e-4)
+    # What the lanes' order-8 steps differ from DOP853, in sd of the noise of 0.02.
+    assert found.rms < 0.01
+
+
+def test_a_strong_effect_is_named_and_a_weak_one_is_not():
+    """A damping of many sd beats nothing by far and every rival; the same a hundred times weaker does neither."""
+    setup, public = setting("pendulum", ["angle_rad"], rows=80, noise=0.01)
+    size = setup.values["m"] * setup.values["l"] ** 2 * 2 * np.pi / setup.system.period(setup.values)
+    told = {}
+    for strength in (0.02, 0.0002):
+        case = case_of(setup, public, Effect("viscous_damping", "theta", {"c": float(strength * size)}))
+        told[strength] = consulted(answer(case), case.noisy)
+    strong, weak = told[0.02], told[0.0002]
+    assert strong["nameable"] and strong["margins"]["nothing"] > 100
+    assert not weak["nameable"] and weak["margins"]["nothing"] < 14
+    # Noise of 80 rows: a rms of 1 with a standard error of 8 %; the forecast is far inside the noise.
+    assert strong["rms"] == pytest.approx(1.0, abs=0.25) and strong["forecast"] < 1.0
+    assert 0 < strong["widths"]["viscous_damping|theta|c"] < 0.2 * 0.02 * size
+
+
+def test_the_oracle_is_asked_once(tmp_path):
+    """Its answer is kept, and asked anew where the answer or the recording is another one."""
+    setup, public = setting("driven_spring", ["q_m"], rows=60)
+    case = case_of(setup, public)
+    public_folder = tmp_path / "public"
+    public_folder.mkdir()
+    (public_folder / "recording.csv").write_text(recording_file(case))
+    document = answer(case)
+    first = asked(tmp_path / "kept.json", document, public_folder)
+    stamp = (tmp_path / "kept.json").stat().st_mtime_ns
+    assert asked(tmp_path / "kept.json", document, public_folder) == first
+    assert (tmp_path / "kept.json").stat().st_mtime_ns == stamp
+    assert asked(tmp_path / "kept.json", document | {"attempts": 2}, public_folder)["of"] != first["of"]
+    assert not first["nameable"] and first["holdout"] == pytest.approx(1.0, abs=0.6)  # 15 rows
+
+
+SAME = [
+    ("driven_spring", ["q_m"], ("sensor_bias", "q_m", {"b": 1.0}), ("constant_force", "q", {"f": 1.0})),
+    ("driven_spring", ["q_m"], ("sensor_gain", "q_m", {"g": 1.0}), ("parameter_error", "gain", {"d": 1.0})),
+    ("duffing", ["q_m"], ("sensor_gain", "q_m", {"g": 1.0}), ("cubic_stiffness", "q", {"k": 1.0})),
+    ("double_well", ["q_mm"], ("parameter_error", "b", {"d": 1.0}), ("cubic_stiffness", "q", {"k": 1.0})),
+    ("henon_heiles", ["q1_kpc"], ("sensor_gain", "q1_kpc", {"g": 1.0}), ("parameter_error", "lam", {"d": 1.0})),
+    ("orbit", ["x_Mm"], ("sensor_gain", "x_Mm", {"g": 1.0}), ("parameter_error", "mu", {"d": 1.0})),
+    ("coupled", ["x1_m"], ("sensor_bias", "x1_m", {"b": 1.0}), ("constant_force", "x2", {"f": 1.0})),
+    ("coupled", None, ("sensor_gain", "x1_m", {"g": 1.0}), ("sensor_gain", "x2_m", {"g": 1.0})),
+    ("coupled", None, ("coupling_spring", ("x1", "x2"), {"k": 1.0}), ("parameter_error", "kc", {"d": 1.0})),
+    ("elastic_pendulum", ["r_m"], ("constant_force", "r", {"f": 1.0}), ("parameter_error", "l", {"d": 1.0})),
+    ("pendulum", ["angle_rad"], ("parameter_error", "l", {"d": 1.0}), ("parameter_error", "g", {"d": 1.0})),
+]
+
+
+def left_over(name, columns, effects):
+    """Responses to effects that recalibration and free starts leave, and their part of the whole."""
+    setup, public = setting(name, columns, rows=80)
+    document = {"system": name, "columns": [r.column for r in setup.readings], "initial": {}, "free": [], "effects": []}
+    basis, whole = nuisances(setup, public), responses(setup, public, effects)
+    left = whole - basis @ (basis.T @ whole)
+    return document, left, np.linalg.norm(left, axis=0) / np.linalg.norm(whole, axis=0)
+
+
+@pytest.mark.parametrize(("name", "columns", "one", "other"), SAME)
+def test_equivalences_hold_by_computation(monkeypatch, name, columns, one, other):
+    """Both forms move the readings in proportion, once free starts are taken out; and the table says so."""
+    for module in (_concealed_hiding, _concealed_rivals):
+        monkeypatch.setattr(module, "DOSE", 1e-6)
+    effects = [Effect(*one), Effect(*other)]
+    document, left, _ = left_over(name, columns, effects)
+    assert equivalent(document, *(e.key for e in effects))
+    a, b = left.T
+    # Square of the sine between them: zero but for the differences' error, 1e-6 of a response that leaves 1/260 over.
+    assert 1 - (a @ b) ** 2 / (a @ a) / (b @ b) < 3e-4
+
+
+@pytest.mark.parametrize(
+    ("name", "columns", "effect"),
+    [
+        ("coupled", ["x1_m"], ("sensor_gain", "x1_m", {"g": 1.0})),
+        ("pendulum", ["angle_rad"], ("sensor_delay", "angle_rad", {"tau": 0.1})),
+        ("driven_spring", ["speed"], ("constant_force", "q", {"f": 1.0})),
+    ],
+)
+def test_what_calibration_owns_leaves_nothing(monkeypatch, name, columns, effect):
+    """An effect that is swallowed leaves less than a thousandth of itself after free starts."""
+    monkeypatch.setattr(_concealed_rivals, "DOSE", 1e-6)
+    document, _, part = left_over(name, columns, [Effect(*effect)])
+    assert swallowed(document, Effect(*effect).key) and part[0] < 1e-3
+
+
+def test_what_differs_is_not_equivalent(monkeypatch):
+    """Two stiffnesses of a pendulum differ by more than rounding, and the table keeps them apart."""
+    monkeypatch.setattr(_concealed_rivals, "DOSE", 1e-6)
+    effects = [Effect("cubic_stiffness", "theta", {"k": 0.1}), Effect("quadratic_stiffness", "theta", {"k": 0.1})]
+    document, left, _ = left_over("pendulum", ["angle_rad"], effects)
+    a, b = left.T
+    assert 1 - (a @ b) ** 2 / (a @ a) / (b @ b) > 1e-3 and not equivalent(document, *(e.key for e in effects))
