@@ -117,6 +117,7 @@ def test_a_periodic_force_is_named_with_its_frequency():
         assert covers(found["findings"][0], name, truth)
 
 
+@pytest.mark.slow
 def test_a_blow_is_named_with_its_time():
     """A pendulum that is struck once, in the second of two recordings: an impulse, there and then."""
     times, rates = np.linspace(0.0, 12.0, 80), lambda t, x: [x[1], -np.sin(x[0])]
