@@ -161,6 +161,8 @@ def calibrate(
     fits = _costed(problem, fits, weight, precision, mean)
     for count in range(iterations):
         some = np.nonzero(~done)[0]  # lanes that have converged are not stepped again
+        if not len(some):
+            break
         mine = _chosen(fits, some)
         given = precision[some], mean[some], active[some], bounds[some], damping[some]
         step, promised = _steps(problem, mine, weight, *given)
