@@ -117,7 +117,8 @@ def test_prices_are_shared_by_families_then_effects_then_targets(problem):
 @pytest.mark.parametrize("recordings", [1, 2, 3])
 def test_members_in_some_recordings_share_what_their_target_has(recordings):
     """Where all explain alike, every effect and target keeps its price however many choices of recordings there are,
-    half of it for all of them; an impulse, at one time, is in one recording and each is as likely."""
+    half of it for all of them; an impulse, at one time, is in one recording and each is as likely; a change in time
+    that would begin anew in every recording, whose clocks overlap, has a thirtieth for all of them."""
     problem, members = made(recordings), []
     for m in problem.searched:
         once = problem.candidate(m).effect.name == "impulse" and recordings > 1
@@ -134,8 +135,9 @@ def test_members_in_some_recordings_share_what_their_target_has(recordings):
     for m in problem.searched:
         total = whole.get(m, 0.0) + part.get(m, 0.0)
         assert total == pytest.approx(0.5 * price(problem, m), rel=1e-9)
-        halves = recordings > 1 and problem.candidate(m).effect.name != "impulse"
-        assert not halves or whole[m] == pytest.approx(total / 2, rel=1e-9)
+        one = problem.candidate(m).effect
+        every = 1 / 30 if one.family == "time variation" else 1 / 2
+        assert recordings == 1 or one.name == "impulse" or whole[m] == pytest.approx(total * every, rel=1e-9)
     subsets = {problem.members[m].recordings for m in members}
     # All, each one alone, and all but one.
     assert len(subsets) == {1: 1, 2: 3, 3: 7}[recordings]
