@@ -151,7 +151,7 @@ def test_sensor_faults_compose():
 
 def test_a_late_sensor_shows_what_was():
     """y(t) = h(x(t - tau)) from the first row on, before which the motion is the one that led there."""
-    from test_concealed_oracle import setting
+    from concealed_cases import setting
 
     from experiments._concealed_hiding import clean_readings, form_of, starts
 

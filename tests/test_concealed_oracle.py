@@ -2,47 +2,16 @@
 
 import numpy as np
 import pytest
+from concealed_cases import case_of, setting
 
 from experiments import _concealed_hiding, _concealed_rivals
-from experiments._concealed_drawing import Public, Wish, _records
 from experiments._concealed_effects import Effect
 from experiments._concealed_equivalent import equivalent, swallowed
 from experiments._concealed_files import answer, recording_file
 from experiments._concealed_fit import Free, Given, fit
-from experiments._concealed_hiding import Claim, clean_readings, form_of, starts, weights
-from experiments._concealed_nature import Case
+from experiments._concealed_hiding import clean_readings, form_of, starts, weights
 from experiments._concealed_oracle import asked, consulted
-from experiments._concealed_plan import Plan
-from experiments._concealed_planes import ZOO
 from experiments._concealed_rivals import nuisances, responses
-from experiments._concealed_sensors import Setup, expected, moved
-
-NOTHING = Claim(0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-
-
-def setting(name, columns=None, rows=120, noise=0.02, **wish):
-    """A setup of a system with the noise a part of one, and all parameters known."""
-    system, rng = ZOO[name], np.random.default_rng(0)
-    values = system.draw(rng)
-    records = tuple(
-        r._replace(times=r.times[:rows], forecast=r.forecast[:10])
-        for r in _records(rng, system, values, Wish(name, **wish), 1)
-    )
-    readings = tuple(r for r in system.readings if (r.kind == "position" if columns is None else r.column in columns))
-    setup = Setup(system, values, readings, {r.column: noise for r in readings}, "gaussian", 5.0, records)
-    return setup, Public((), {}, {}, ((),) * len(records))
-
-
-def case_of(setup, public, *effects):
-    """A case with these effects and Gaussian noise."""
-    rng, clean, after = np.random.default_rng(1), [], []
-    for record in setup.records:
-        motion = moved(setup, record, effects)
-        clean.append(expected(setup, record, effects, motion, record.times))
-        after.append(expected(setup, record, effects, motion, record.forecast))
-    noisy = [c + weights(setup) * rng.normal(size=c.shape) for c in clean]
-    item = Plan(1, not effects, "open", "", False, "")
-    return Case(item, setup, public, effects, (), 0.0, tuple(noisy), tuple(clean), tuple(after), NOTHING, 1)
 
 
 def test_a_fit_of_the_true_form_finds_the_truth():

@@ -2,22 +2,17 @@
 
 import numpy as np
 import pytest
-from test_concealed_oracle import case_of, setting
+from concealed_cases import damped_duffing, setting
 
-from experiments._concealed_effects import Effect
-from experiments._concealed_files import answer
 from experiments._concealed_network import network_force
 from experiments._concealed_repair import free_run_errors, momenta, smoothed
-from experiments._concealed_today import library, practised, right_terms, weak
+from experiments._concealed_today import library, right_terms, weak
 
 
 @pytest.fixture(scope="module")
 def damped():
-    """A damped Duffing oscillator with hardly any noise, 13 rows in a period: its answer and readings."""
-    setup, public = setting("duffing", rows=160, noise=0.0001)
-    size = setup.values["m"] * 2 * np.pi / setup.system.period(setup.values)
-    case = case_of(setup, public, Effect("viscous_damping", "q", {"c": float(0.02 * size)}))
-    return answer(case), case.noisy
+    """The damped Duffing oscillator, drawn once."""
+    return damped_duffing()
 
 
 def test_smoothing_gives_velocities_and_the_missing_force(damped):
@@ -83,11 +78,3 @@ def test_a_network_learns_a_damping(damped):
     force = network_force(smoothed(document, seen, 0.0).runs)
     v = np.linspace(-0.5, 0.5, 5)[None, :]
     assert np.all(np.diff(force(np.zeros_like(v), v)[0]) < 0)
-
-
-def test_pysindy_finds_a_clear_damping(damped):
-    """Where everything is read and little disturbs, plain SINDy names the damping exactly."""
-    pytest.importorskip("pysindy", reason="PySINDy is only in the environment of `make proof`")
-    found = practised(*damped, ["sindy", "ensemble"])
-    assert found["sindy"]["exact"] and found["ensemble"]["exact"]
-    assert found["sindy"]["holdout"] < found["none"]["holdout"]
