@@ -30,10 +30,10 @@ def values(name, **changed):
     return {c: changed.get(c, VALUES[c]) for c in VOCABULARY[name].coefficients}
 
 
-def said(name, side=None, units=None, share=None, rivals=(), only=None, **changed):
+def said(name, side=None, units=None, strength=None, rivals=(), only=None, **changed):
     """The sentence of a finding, with standard deviations of a twentieth."""
     estimates = {
         c: v if isinstance(v, str) else {"mean": v, "sd": abs(v) / 20, "interval95": [0.9 * v, 1.1 * v]}
         for c, v in values(name, **changed).items()
     }
-    return finding_sentence(candidate(name, side), estimates, share, units or {}, rivals, only)
+    return finding_sentence(candidate(name, side), estimates, strength, units or {}, rivals, only)

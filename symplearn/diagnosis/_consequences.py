@@ -32,6 +32,10 @@ class Said:
         """A pure number's size, `20 +- 1.5 %`."""
         return f"{self._spread(name, math.copysign(100.0, self.mean(name)))} %"
 
+    def by_sign(self, name: str, positive: str, negative: str) -> str:
+        """One of two words, by the sign of the mean."""
+        return positive if self.mean(name) > 0 else negative
+
     def _spread(self, name: str, factor: float) -> str:
         mean, sd = (self.coefficients[name].get(key) for key in ("mean", "sd"))
         return number(factor * mean) + ("" if sd is None else f" +- {number(abs(factor) * sd)}")
@@ -62,34 +66,35 @@ def consequence(said: Said) -> str:
 
 
 def _stiffens(said: Said) -> str:
-    way = "pulls back and raises" if said.mean("k") > 0 else "pushes away and lowers"
+    way = said.by_sign("k", "pulls back and raises", "pushes away and lowers")
     return f"It {way} the frequency at every amplitude; no energy is lost."
 
 
 def _uneven(said: Said) -> str:
-    stiffer, softer = ("positive", "negative") if said.mean("k") > 0 else ("negative", "positive")
+    stiffer, softer = said.by_sign("k", "positive", "negative"), said.by_sign("k", "negative", "positive")
     q = said.one.targets[0]
     return f"It makes the motion uneven: stiffer towards {stiffer} {q}, softer towards {softer}; it takes no energy."
 
 
 def _hardens(said: Said) -> str:
-    way = "rises" if said.mean("k") > 0 else "falls"
+    way = said.by_sign("k", "rises", "falls")
     return f"The frequency {way} with the amplitude; no energy is lost."
 
 
 def _excites(said: Said) -> str:
-    inside, outside = ("feeds energy in", "takes it out") if said.mean("c") > 0 else ("takes energy out", "feeds it in")
+    inside = said.by_sign("c", "feeds energy in", "takes energy out")
+    outside = said.by_sign("c", "takes it out", "feeds it in")
     a, q = said.plain("a"), said.one.targets[0]
     return f"It {inside} while {q} stays within a = {a} and {outside} beyond, on either side."
 
 
 def _bends_orbits(said: Said) -> str:
-    way = "attracts" if said.mean("b") > 0 else "repels"
+    way = said.by_sign("b", "attracts", "repels")
     return f"It {way}, strongly at small r alone, so orbits precess; it changes neither energy nor angular momentum."
 
 
 def _couples(said: Said) -> str:
-    q, q2, way = *said.one.targets, "raises" if said.mean("k") > 0 else "lowers"
+    q, q2, way = *said.one.targets, said.by_sign("k", "raises", "lowers")
     return (
         f"It {way} the frequency at which {q} and {q2} move against each other, lets energy pass between them, "
         "and leaves their common motion alone."
@@ -110,7 +115,7 @@ def _pushes(said: Said) -> str:
 
 
 def _strikes(said: Said) -> str:
-    way = "up" if said.mean("j") > 0 else "down"
+    way = said.by_sign("j", "up", "down")
     return (
         f"The momentum jumps {way} by {said.plain('j')} at t = {said.value('t_star')}; before and after "
         "that, it adds nothing."
@@ -122,12 +127,12 @@ def _swings(said: Said) -> str:
 
 
 def _creeps(said: Said) -> str:
-    way = "grows" if said.mean("r") > 0 else "falls"
+    way = said.by_sign("r", "grows", "falls")
     return f"It {way} by {said.percent('r')} {said.per_time('r')} of its value at the first row."
 
 
 def _switches(said: Said) -> str:
-    way = "higher" if said.mean("d") > 0 else "lower"
+    way = said.by_sign("d", "higher", "lower")
     return f"From t = {said.value('t_star')} on it is {said.percent('d')} {way} than before."
 
 
@@ -139,7 +144,7 @@ def _exchanges(said: Said) -> str:
 
 
 def _corrects(said: Said) -> str:
-    way = "higher" if said.mean("d") > 0 else "lower"
+    way = said.by_sign("d", "higher", "lower")
     return f"It should be {said.percent('d')} {way} than given; the form of the equations stays as it is."
 
 
@@ -150,17 +155,17 @@ def _scatters(said: Said) -> str:
 
 
 def _offsets(said: Said) -> str:
-    way = "high" if said.mean("b") > 0 else "low"
+    way = said.by_sign("b", "high", "low")
     return f"It reads {said.plain('b')} too {way} throughout; {_ALONE}"
 
 
 def _scales(said: Said) -> str:
-    way = "large" if said.mean("g") > 0 else "small"
+    way = said.by_sign("g", "large", "small")
     return f"It shows everything {said.percent('g')} too {way}; {_ALONE}"
 
 
 def _wanders(said: Said) -> str:
-    unit, way = said.units.get("r"), "up" if said.mean("r") > 0 else "down"
+    unit, way = said.units.get("r"), said.by_sign("r", "up", "down")
     rate = number(abs(said.mean("r"))) + (f" {unit}" if unit else " per unit of time")
     return f"It creeps {way} by {rate}, counted from the first row; {_ALONE}"
 
@@ -192,7 +197,7 @@ _DOES: dict[str, Callable[[Said], str]] = {
     "relative_damping": _same("It takes out energy where {q} and {q2} move apart or together; common motion is free."),
     "self_excitation": _excites,
     "constant_force": lambda said: (
-        f"It always pushes towards {'positive' if said.mean('f') > 0 else 'negative'} {said.one.targets[0]}, so that a "
+        f"It always pushes towards {said.by_sign('f', 'positive', 'negative')} {said.one.targets[0]}, so that a "
         "point of rest moves that way; no energy is lost."
     ),
     "linear_stiffness": _stiffens,

@@ -81,12 +81,16 @@ _PREPOSITIONS = {
     **dict.fromkeys(("relative_damping", "coupling_spring", "gyroscopic_coupling"), "between"),
     "central_correction": "in the plane of",
 }
+# Their amplitudes are measured otherwise than by the force along the motion, so their strength is no ratio of forces: a
+# stop by its stiffness, a blow by its momentum, a hidden oscillator by its coupling, a self-excitation by two forces
+# against each other.
+_NO_RATIO = ("contact_stop", "impulse", "hidden_oscillator", "self_excitation")
 
 
 def finding_sentence(
     one: Candidate,
     coefficients: Mapping[str, Any],
-    share: float | None,
+    strength: float | None,
     units: Mapping[str, str | None],
     rivals: Sequence[str],
     only: Sequence[int] | None,
@@ -94,7 +98,8 @@ def finding_sentence(
     """What was left out and where, its law with numbers, how strong it is, what it does, what it is hard to tell from.
 
     **Arguments:** - `coefficients`: mean, sd and interval95 by name; for `unnamed_force` its `expression`, a text.
-    - `share`: rms of the effect's force over that of the forces already there; `None` where it is no force.
+    - `strength`: size of the effect's amplitudes in units of those that its prior takes to be as strong as the forces
+    already there; `None` where it is no force.
     - `units`: by coefficient, `None` where unknown. - `rivals`: effects such as `quadratic_drag(theta)`.
     - `only`: the recordings, from 1, that it is in; `None` for all.
     """
@@ -103,12 +108,21 @@ def finding_sentence(
     words = [f"{opening}: {_law_with_numbers(said)}."]
     if only:
         words.append(f"It is in recording{'s' if len(only) > 1 else ''} {_listed([str(r) for r in only], 'and')} only.")
-    if share is not None and math.isfinite(share):
+    share = _share_of_forces(one.effect.name, strength)
+    if share is not None:
         words.append(f"Its force is about {100 * share:.2g} % of the forces already there.")
     words.append(consequence(said))
     if rivals:
         words.append(f"This recording hardly tells it from {_listed([in_words(rival) for rival in rivals], 'or')}.")
     return " ".join(words)
+
+
+def _share_of_forces(effect: str, strength: float | None) -> float | None:
+    """Root mean square of an effect's force over that of the forces already there; `None` where it is not known."""
+    if strength is None or not math.isfinite(strength) or effect in _NO_RATIO:
+        return None
+    # As strong as the forces already there is a cosine whose amplitude is their root mean square.
+    return strength / math.sqrt(2) if effect == "periodic_forcing" else strength
 
 
 def _law_with_numbers(said: Said) -> str:
