@@ -8,9 +8,9 @@ from augmented_cases import (
     CURVED,
     CURVED_PAIR,
     FLAT_PAIR,
+    LEAPFROG,
     LENGTH,
     MASS,
-    MIDWAY,
     PAIR_START,
     SOFT,
     START,
@@ -58,10 +58,10 @@ PAIRS = {
     "gyroscopic_coupling": ({"b": 0.6}, lambda q, v: [0.6 * v[1], -0.6 * v[0]]),
 }
 SHAPES = pytest.mark.parametrize(
-    ("built", "method", "rates"), [(SOFT, MIDWAY, soft), (CURVED, TAO, curved)], ids=["separable", "nonseparable"]
+    ("built", "method", "rates"), [(SOFT, LEAPFROG, soft), (CURVED, TAO, curved)], ids=["separable", "nonseparable"]
 )
 PAIR_SHAPES = pytest.mark.parametrize(
-    ("built", "method", "rates"), [(FLAT_PAIR, MIDWAY, flat_pair), (CURVED_PAIR, TAO, curved_pair)],
+    ("built", "method", "rates"), [(FLAT_PAIR, LEAPFROG, flat_pair), (CURVED_PAIR, TAO, curved_pair)],
     ids=["separable", "nonseparable"],
 )  # fmt: skip
 # Splitting at order two at dt = 0.01, and the kink of a stop: 1e-4 times some constants. All else is of order four.
@@ -120,7 +120,7 @@ def test_the_second_coordinate_is_its_own_target(effect):
     """An effect on the second of two coordinates pushes that one alone."""
     row = next(row for row in FORCES if row[0] == effect)
     rates = lambda force: lambda t, x: flat_pair(lambda q, v: [0.0, force(t, q[1], v[1])])(t, x)  # noqa: E731
-    found = moved(FLAT_PAIR, MIDWAY, vector(FLAT_PAIR, effect, row[2], target="q2"), PAIR_START)
+    found = moved(FLAT_PAIR, LEAPFROG, vector(FLAT_PAIR, effect, row[2], target="q2"), PAIR_START)
     check(found, by_hand(rates(row[3]), PAIR_START), by_hand(rates(lambda t, q, v: 0.0), PAIR_START), effect)
 
 
@@ -129,7 +129,7 @@ def test_all_at_once_is_the_sum():
     values = sum(vector(SOFT, effect, values, side=side) for effect, side, values, _ in FORCES)
     expected = by_hand(soft(lambda t, q, v: sum(force(t, q, v) for *_, force in FORCES)))
     # Two thresholds and three drags of order two.
-    np.testing.assert_allclose(moved(SOFT, MIDWAY, values), expected, atol=2e-4)
+    np.testing.assert_allclose(moved(SOFT, LEAPFROG, values), expected, atol=2e-4)
 
 
 HIDDEN = {"omega": 1.3, "kappa": 0.9}
@@ -156,7 +156,7 @@ def test_a_hidden_oscillator_starts_where_it_hangs_on_nothing():
     """At strength zero the motion's slope in the strength is that of a small one: no square root is in the way."""
     values = vector(SOFT, "hidden_oscillator", {"omega": 1.3, "kappa": 0.0})
     place = int(np.argmax(values == 1.3)) - 1
-    run = lambda s: flow(SOFT, MIDWAY, jnp.asarray(values).at[place].set(s), widened(START), 0.0, 0.01, 300)  # noqa: E731
+    run = lambda s: flow(SOFT, LEAPFROG, jnp.asarray(values).at[place].set(s), widened(START), 0.0, 0.01, 300)  # noqa: E731
     slope = jax.jvp(run, (0.0,), (1.0,))[1]
     expected = (run(1e-5) - run(-1e-5)) / 2e-5
     # Third derivatives times 1e-10.

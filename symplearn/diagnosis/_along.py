@@ -11,31 +11,34 @@ from jaxtyping import Array, Float
 
 import integrators as ig
 
-from .._augmented_flow import SimulatedHamiltonian, SimulatedReading
+from .._augmented_flow import SimulatedReading
+from .._augmented_system import Simulated
 from ._problem import Combination, Problem
 
+# Of a system, at a phase point, with its inputs, at a time.
+What = Callable[[Simulated, Array, Array, Array], Array]
 
-def velocity(system: SimulatedHamiltonian, x: Array) -> Array:
-    return system.velocity(*ig.split(x))
+
+def velocity(system: Simulated, x: Array, u: Array, t: Array) -> Array:
+    return system.at(t, u).velocity(*ig.split(x))
 
 
-def force(system: SimulatedHamiltonian, x: Array) -> Array:
+def force(system: Simulated, x: Array, u: Array, t: Array) -> Array:
     """Every force but dry friction and impulses."""
-    return system.rates(x)[system.equations.width :]
+    return system.at(t, u).rates(x)[system.equations.width :]
 
 
-def energy(system: SimulatedHamiltonian, x: Array) -> Array:
-    return system.energy(*ig.split(x))
+def energy(system: Simulated, x: Array, u: Array, t: Array) -> Array:
+    return system.at(t, u).energy(*ig.split(x))
 
 
-def readings(system: SimulatedHamiltonian, x: Array) -> Array:
-    read = SimulatedReading(system.equations, system.parameters, system.coefficients)
-    return read(x, (system.time, system.inputs))
+def readings(system: Simulated, x: Array, u: Array, t: Array) -> Array:
+    return SimulatedReading(system.equations, system.parameters, system.coefficients)(x, (t, u))
 
 
 def along(
     problem: Problem,
-    what: Callable[[SimulatedHamiltonian, Array], Array],
+    what: What,
     recording: int,
     z: Float[np.ndarray, " z"],
     combination: Combination,
@@ -51,16 +54,13 @@ def along(
 
 @eqx.filter_jit
 def _mapped(equations: Any, what: Any, parameters: Array, coefficients: Array, states: Array, inputs: Array, times):
-    def one(x: Array, u: Array, t: Array) -> Array:
-        sudden = jnp.full((), 1e-9, x.dtype)
-        return what(SimulatedHamiltonian(equations, parameters, u, t, coefficients, sudden), x)
-
-    return jax.vmap(one)(states, inputs, times)
+    system = Simulated(equations, parameters, coefficients)
+    return jax.vmap(lambda x, u, t: what(system, x, u, t))(states, inputs, times)
 
 
 def along_all(
     problem: Problem,
-    what: Callable[[SimulatedHamiltonian, Array], Array],
+    what: What,
     z: Float[np.ndarray, " z"],
     paths: Sequence[Float[np.ndarray, "_ state"]],
 ) -> np.ndarray:

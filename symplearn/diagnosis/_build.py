@@ -10,7 +10,6 @@ import sympy
 import integrators as ig
 
 from .._augmented import Equations, equations
-from .._augmented_flow import Midway
 from .._effects import DELAY, EFFECTS, ERROR, HIDDEN, NOISE, OUTLIERS, Candidate, Effect
 from .._errors import InputError, nearest, shown
 from .._expression import symbol
@@ -145,7 +144,7 @@ def _is_open(file: SimulationFile, candidate: Candidate) -> bool:
 def _integrator(file: SimulationFile, built: Equations, substep: float) -> ig.AbstractIntegrator:
     """The file's symplectic method; the flow composes it to order 4, so that its error stays below what is sought."""
     if file.integrator.name != "tao" and built.separable:
-        return Midway()
+        return ig.Leapfrog()
     return ig.Tao(omega=jnp.asarray(_BINDING / substep))
 
 

@@ -13,7 +13,7 @@ from ._evidence import Laplace, laplace
 from ._path import backward_lanes, forward_lanes
 from ._problem import Combination, Problem
 from ._stochastic import padded
-from ._trajectory import LANES, Stepper
+from ._trajectory import LANES, Stepper, switches_of
 
 # Steps towards a smaller or larger reading noise are lengthened this much: plain EM is slow where noise is small.
 _HASTE = 1.5
@@ -131,6 +131,7 @@ def _pass(stepper, fits: list[PathFit], r: int, rows: int, weight: np.ndarray, s
         jnp.asarray(padded(problem.rows[r].readings[:rows], length, np.nan)),
         variances,
         jnp.asarray(np.stack([fit.intensity for fit in fits])),
+        switches_of(problem, r, hots),
     )
     return linear, variances, done
 

@@ -1,6 +1,5 @@
 """One hypothesis shown on the recordings: filtered where it was fitted, run freely where it was not."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,7 +10,7 @@ from scipy.interpolate import CubicSpline
 
 from .._filter import Filtered
 from .._smoother import Smoothed
-from ._along import along, readings
+from ._along import What, along, readings
 from ._stochastic import free_run, row_roots, run_filter, run_smoother
 from ._trajectory import Stepper
 from ._weighed import Estimate
@@ -92,7 +91,7 @@ class Outlook:
         means = np.asarray(self._filtered[1].filtered_means[: self.rows.fitted])
         return self.along(readings, means)
 
-    def along(self, what: Callable[[Any, Any], Any], states: Float[np.ndarray, "row state"]) -> np.ndarray:
+    def along(self, what: What, states: Float[np.ndarray, "row state"]) -> np.ndarray:
         """Something that the augmented simulation has at phase points of the leading rows."""
         e = self.estimate
         return along(self.stepper.problem, what, self.recording, e.z, e.combination, states)

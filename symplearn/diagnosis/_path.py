@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._augmented_system import EVERYTHING, Switches
 from ._trajectory import Course, effect_coefficients, model_at
 
 
@@ -39,13 +40,16 @@ class Pass(NamedTuple):
     variances: Float[Array, "time channel"]
 
 
-def linearise(equations, integrator, course: Course, path, calibrated, slots, onehot, readings) -> Linear:
+def linearise(
+    equations, integrator, course: Course, path, calibrated, slots, onehot, readings, switches: Switches = EVERYTHING
+) -> Linear:
     """Linearise flow and observation about a path (time, state) at theta = [calibrated, slots]."""
     theta = jnp.concatenate([calibrated, slots])
     f = calibrated.shape[0]
 
     def flow_and_read(x, theta, k):
-        flow, read = model_at(equations, integrator, course, theta[:f], effect_coefficients(theta[f:], onehot))
+        found = effect_coefficients(theta[f:], onehot)
+        flow, read = model_at(equations, integrator, course, theta[:f], found, switches)
         span = jax.tree.map(lambda leaf: leaf[k], course.spans)
         return flow(x, span), read(x, (course.times[k], course.inputs[k]))
 
@@ -144,13 +148,15 @@ def backward(linear: Linear, done: Pass, variances: Array, delta: Array) -> Smoo
 
 
 @eqx.filter_jit
-def forward_lanes(equations, integrator, course, paths, calibrated, slots, onehots, readings, variances, intensities):
+def forward_lanes(
+    equations, integrator, course, paths, calibrated, slots, onehots, readings, variances, intensities, switches
+):
     """Linearise and filter every lane over the leading rows that `paths` (lane, time, state) covers."""
     lengths = course.spans.step * course.spans.inputs.shape[1]
     n = paths.shape[1]
 
     def lane(path, c, s, onehot, r, q):
-        linear = linearise(equations, integrator, course, path, c, s, onehot, readings)
+        linear = linearise(equations, integrator, course, path, c, s, onehot, readings, switches)
         return linear, forward(linear, r, q, lengths[:n])
 
     return jax.vmap(lane)(paths, calibrated, slots, onehots, variances, intensities)

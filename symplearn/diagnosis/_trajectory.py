@@ -16,6 +16,8 @@ import integrators as ig
 
 from .._augmented import Equations
 from .._augmented_flow import SimulatedFlow, SimulatedReading, Span
+from .._augmented_system import EVERYTHING, Switches
+from .._effects import COULOMB, DELAY, IMPULSE, Effect
 from ._problem import Combination, Problem
 
 DIRECTIONS = 6  # slopes are taken along a multiple of this many directions, so that few programs are compiled
@@ -65,14 +67,15 @@ def _course(problem: Problem, r: int, length: int) -> Course:
 
 
 def model_at(
-    equations: Equations, integrator: ig.AbstractIntegrator, course: Course, calibrated: Array, coefficients: Array
-) -> tuple[SimulatedFlow, SimulatedReading]:
+    equations: Equations, integrator: ig.AbstractIntegrator, course: Course, calibrated: Array, coefficients: Array,
+    switches: Switches = EVERYTHING,
+) -> tuple[SimulatedFlow, SimulatedReading]:  # fmt: skip
     """Flow and observation at calibrated values, with `coefficients` added to the terms already there."""
     parameters = course.parameters + calibrated @ course.to_parameters
     total = course.terms + calibrated @ course.to_coefficients + coefficients
     return (
-        SimulatedFlow(equations, integrator, parameters, total),
-        SimulatedReading(equations, parameters, total),
+        SimulatedFlow(equations, integrator, parameters, total, switches),
+        SimulatedReading(equations, parameters, total, switches),
     )
 
 
@@ -81,14 +84,26 @@ def effect_coefficients(slots: Float[Array, " slot"], onehot: Float[Array, "row 
     return jnp.append(slots, 1.0) @ onehot
 
 
+def switches_of(problem: Problem, recording: int, hots: Float[np.ndarray, "lane row coefficient"]) -> Switches:
+    """What none of the lanes that are stepped together has, nor any known term."""
+    eq, c = problem.equations, problem.calibrated
+    on = (problem.terms[recording] != 0) | (hots != 0).any((0, 1))
+    on[c.place[c.parameters :]] = True
+
+    def has(effect: Effect) -> Array:
+        return jnp.asarray(bool(on[eq.firsts(effect)].any()))
+
+    return Switches(has(COULOMB), has(IMPULSE) | bool(eq.jumping), has(DELAY))
+
+
 @eqx.filter_jit
-def _sensitivities(equations, integrator, course, zs, onehots, directions, rows):
+def _sensitivities(equations, integrator, course, zs, onehots, directions, rows, switches):
     """Readings (lane, time, channel) and their slopes (lane, direction, time, channel) over the first `rows` rows."""
     state, f = 2 * equations.width, course.to_parameters.shape[0]
 
     def readings(z, onehot):
         coefficients = effect_coefficients(z[state + f :], onehot)
-        flow, read = model_at(equations, integrator, course, z[state : state + f], coefficients)
+        flow, read = model_at(equations, integrator, course, z[state : state + f], coefficients, switches)
 
         def body(k, carry):
             x, out = carry
@@ -161,8 +176,9 @@ class Stepper:
             directions[lane, np.arange(len(places)), places] = 1.0
         some, matrices, along_some = (jnp.asarray(a[lanes]) for a in (local_z, hots, directions))
         out, slopes = _sensitivities(
-            p.equations, p.integrator, self.courses[r], some, matrices, along_some, jnp.asarray(rows)
-        )
+            p.equations, p.integrator, self.courses[r], some, matrices, along_some, jnp.asarray(rows),
+            switches_of(p, r, hots),
+        )  # fmt: skip
         return np.asarray(out)[:number], np.asarray(slopes)[:number]
 
     def responses(

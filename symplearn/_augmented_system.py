@@ -1,0 +1,181 @@
+"""The augmented simulation as a Hamiltonian system: its energy with every effect, and forces that a velocity enters."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+import integrators as ig
+
+from ._augmented import Equations
+from ._effects import (
+    COULOMB,
+    DRIFTING,
+    ERROR,
+    EXCITATION,
+    FORCING,
+    GYROSCOPIC,
+    HIDDEN,
+    MODULATION,
+    QUADRATIC,
+    REGIME,
+    RELATIVE,
+    STOP,
+    VISCOUS,
+    Effect,
+)
+
+# The values of an effect by target, by its name and side; a tuple over its values.
+Values = Mapping[tuple[str, str | None], tuple[Float[Array, " target"], ...]]
+
+
+def taken_apart(equations: Equations, coefficients: Float[Array, " coefficient"]) -> Values:
+    """The coefficient vector by effect; once before a trajectory, since picking entries costs as much as a force."""
+    found = {}
+    for one in {(c.effect, c.side): c for c in equations.candidates}.values():
+        firsts = equations.firsts(one.effect, one.side)
+        entries = range(one.effect.size + one.effect.switched)
+        found[one.effect.name, one.side] = tuple(coefficients[firsts + k] for k in entries)
+    return found
+
+
+class Switches(eqx.Module):
+    """What may be left out of the work because no trajectory that is stepped together with this one has it."""
+
+    friction: Bool[Array, ""] | bool = True
+    impulses: Bool[Array, ""] | bool = True
+    delays: Bool[Array, ""] | bool = True
+
+
+EVERYTHING = Switches()
+
+
+class Moment(eqx.Module):
+    """What depends on time alone: parameters as they stand, and periodic forces."""
+
+    time: Float[Array, "..."]
+    parameters: Float[Array, "... parameter"]
+    push: Float[Array, "... declared"]
+
+
+class SimulatedHamiltonian(ig.AbstractHamiltonian):
+    """The Hamiltonian of a simulation file with its effects, for any H(q, p), frozen at one moment.
+
+    Frozen in the middle of a step it is right to order two in time, and the step stays symmetric.
+    """
+
+    equations: Equations = eqx.field(static=True)
+    coefficients: Float[Array, " coefficient"]
+    values: Values
+    inputs: Float[Array, " input"]
+    moment: Moment
+
+    def of(self, effect: Effect, value: int = 0, side: str | None = None) -> Float[Array, " target"]:
+        """One value of an effect, by target."""
+        return self.values[effect.name, side][value]
+
+    @eqx.filter_jit
+    def arguments(self, q: Float[Array, " width"], p: Float[Array, " width"]) -> Float[Array, " argument"]:
+        """The vector that the compiled equations take."""
+        d, now = self.equations.dim, self.moment
+        return jnp.concatenate([q[:d], p[:d], now.parameters, self.inputs, now.time[None], self.coefficients])
+
+    def energy(self, q: Float[Array, " width"], p: Float[Array, " width"]) -> Float[Array, ""]:
+        return self.equations.energy(self.arguments(q, p))[0]
+
+    @eqx.filter_jit
+    def velocity(self, q: Float[Array, " width"], p: Float[Array, " width"]) -> Float[Array, " width"]:
+        return jnp.concatenate([self.equations.velocity(self.arguments(q, p)), p[self.equations.dim :]])
+
+    @eqx.filter_jit
+    def slope(self, q: Float[Array, " width"], p: Float[Array, " width"]) -> Float[Array, " width"]:
+        """Minus every force that no velocity enters."""
+        d, n = self.equations.dim, self.equations.declared
+        push = self.moment.push
+        push = push - self.of(STOP, 0, "upper") * jnp.maximum(q[:n] - self.of(STOP, 1, "upper"), 0.0)
+        push = push + self.of(STOP, 0, "lower") * jnp.maximum(self.of(STOP, 1, "lower") - q[:n], 0.0)
+        slope = self.equations.slope(self.arguments(q, p))
+        if not self.equations.hidden:
+            return slope - jnp.pad(push, (0, d - n))
+        present, omega = self.of(HIDDEN, 2), self.of(HIDDEN, 1)
+        unseen = (present * omega**2).sum() * q[d] - (self.of(HIDDEN) * q[:n]).sum()
+        return jnp.concatenate([slope - jnp.pad(push + present * q[d], (0, d - n)), unseen[None]])
+
+    @eqx.filter_jit
+    def smooth_force(self, q: Float[Array, " width"], p: Float[Array, " width"]) -> Float[Array, " d"]:
+        """Forces that a velocity enters, dry friction left out."""
+        eq, n = self.equations, self.equations.declared
+        arguments = self.arguments(q, p)
+        v = eq.velocity(arguments)[:n]
+        drag = self.of(VISCOUS) + self.of(QUADRATIC) * jnp.abs(v) - self.of(EXCITATION)
+        force = -(drag + self.of(EXCITATION, 1) * q[:n] ** 2) * v
+        force = jnp.pad(force + self._between(v), (0, eq.dim - n))
+        return force if eq.kick is None else force + eq.kick(arguments)
+
+    def _between(self, v: Float[Array, " declared"]) -> Float[Array, " declared"]:
+        """Forces between pairs of coordinates that a velocity enters."""
+        total = [jnp.zeros((), v.dtype)] * len(v)
+        for k, (i, j) in enumerate(zip(*self.equations.pairs(), strict=True)):
+            relative, turning = self.of(RELATIVE)[k] * (v[i] - v[j]), self.of(GYROSCOPIC)[k]
+            total[i] = total[i] + turning * v[j] - relative
+            total[j] = total[j] + relative - turning * v[i]
+        return jnp.stack(total)
+
+    def rates(self, x: Float[Array, " state"]) -> Float[Array, " state"]:
+        """The right-hand side with every force but impulses."""
+        q, p = ig.split(x)
+        eq = self.equations
+        dry = self.of(COULOMB) * jnp.sign(self.velocity(q, p)[: eq.declared])
+        force = self.smooth_force(q, p) - jnp.pad(dry, (0, eq.dim - eq.declared))
+        before = jnp.zeros(eq.momentum.start, x.dtype)
+        return self.vector_field(x) + jnp.concatenate([before, jnp.pad(force, (0, eq.width - eq.dim))])
+
+
+class Simulated(eqx.Module):
+    """An augmented simulation with its numbers: what gives its Hamiltonian at any time."""
+
+    equations: Equations = eqx.field(static=True)
+    parameters: Float[Array, " parameter"]
+    coefficients: Float[Array, " coefficient"]
+    values: Values
+
+    def __init__(self, equations: Equations, parameters: Any, coefficients: Any):
+        self.equations = equations
+        self.parameters, self.coefficients = jnp.asarray(parameters), jnp.asarray(coefficients)
+        self.values = taken_apart(equations, self.coefficients)
+
+    def at(
+        self, t: Float[Array, ""] | float, inputs: Float[Array, " input"], width: Float[Array, ""] | float = 1e-9
+    ) -> SimulatedHamiltonian:
+        """The system at one time; `width` as in `moment`."""
+        return self.frozen(self.moment(jnp.asarray(t, self.coefficients.dtype), width), inputs)
+
+    def frozen(self, moment: Moment, inputs: Float[Array, " input"]) -> SimulatedHamiltonian:
+        """The system with everything that depends on time as it stands at a moment."""
+        return SimulatedHamiltonian(self.equations, self.coefficients, self.values, inputs, moment)
+
+    def moments(self, times: Sequence[Array], width: Float[Array, ""]) -> Moment:
+        """Moments of several times, by a leading axis."""
+        return jax.vmap(lambda t: self.moment(t, width))(jnp.stack(list(times)))
+
+    def moment(self, t: Float[Array, ""], width: Float[Array, ""] | float) -> Moment:
+        """What depends on time alone.
+
+        `width` is the time over which a sudden change of a parameter is spread, so that its time has a derivative.
+        """
+        of = lambda effect, k=0: self.values[effect.name, None][k]  # noqa: E731
+        wide = jnp.where(jnp.asarray(width) > 0, width, 1.0)  # rows that only fill up have none
+        after = jnp.clip((t - of(REGIME, 1)) / wide + 0.5, 0.0, 1.0)
+        factor = (1 + of(ERROR)) * (1 + of(DRIFTING) * (t - self.equations.start))
+        factor = factor * (1 + self._oscillation(MODULATION, t)) * (1 + of(REGIME) * after)
+        n = factor.shape[0]
+        parameters = jnp.concatenate([self.parameters[:n] * factor, self.parameters[n:]])
+        return Moment(t, parameters, self._oscillation(FORCING, t))
+
+    def _oscillation(self, effect: Effect, t: Array) -> Float[Array, " target"]:
+        cosine, sine, omega = self.values[effect.name, None]
+        angle = omega * (t - self.equations.origin)
+        return cosine * jnp.cos(angle) + sine * jnp.sin(angle)
