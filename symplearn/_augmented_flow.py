@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 import integrators as ig
 
@@ -19,11 +19,19 @@ _STAGES = np.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]])
 
 
 class Span(eqx.Module):
-    """One interval between rows: where it starts, its substep, and the inputs' mean over each substep."""
+    """One interval between rows: where it starts, its substep, how many, and the inputs' mean over each of them.
+
+    Their number is data, so that finer steps are no new program; without inputs there is one empty row of them.
+    """
 
     start: Float[Array, "..."]
     step: Float[Array, "..."]
     inputs: Float[Array, "... substep input"]
+    pieces: Int[Array, "..."]
+
+    @property
+    def length(self) -> Float[Array, "..."]:
+        return self.step * self.pieces
 
 
 class SimulatedFlow(eqx.Module):
@@ -46,11 +54,11 @@ class SimulatedFlow(eqx.Module):
         self.switches = switches
 
     def __call__(self, x: Float[Array, " state"], span: Span) -> Float[Array, " state"]:
-        def substep(carry: tuple[Array, Array], inputs: Array) -> tuple[tuple[Array, Array], None]:
-            x, t = carry
-            return (self._substep(x, t, span.step, inputs), t + span.step), None
+        def substep(k: Array, x: Array) -> Array:
+            inputs = span.inputs[k] if span.inputs.shape[-1] else span.inputs[0]
+            return self._substep(x, span.start + k * span.step, span.step, inputs)
 
-        return jax.lax.scan(substep, (x, span.start), span.inputs)[0][0]
+        return jax.lax.fori_loop(0, span.pieces, substep, x)
 
     def _substep(self, x: Array, t: Array, dt: Array, inputs: Array) -> Array:
         weights = jnp.asarray(ig.suzuki4(self.integrator).weights, x.dtype)

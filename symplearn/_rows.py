@@ -120,11 +120,11 @@ def spans_between(times: Float[np.ndarray, " time"], pieces: int, inputs: Any) -
     step = np.diff(times) / pieces
     edges = times[:-1, None] + step[:, None] * np.arange(pieces + 1)
     if inputs is None:
-        values = np.zeros((len(step), pieces, 0))
+        values = np.zeros((len(step), 1, 0))
     else:
         flat = inputs.mean_over(edges[:, :-1].ravel(), edges[:, 1:].ravel())
         values = flat.reshape(len(step), pieces, -1)
-    return Span(jnp.asarray(times[:-1]), jnp.asarray(step), jnp.asarray(values))
+    return Span(jnp.asarray(times[:-1]), jnp.asarray(step), jnp.asarray(values), jnp.full(len(step), pieces))
 
 
 def _at(inputs: Any, times: np.ndarray) -> np.ndarray:

@@ -58,7 +58,7 @@ def _moved(built, method, values, x, start, step, inputs, count):
     flow = SimulatedFlow(built, method, jnp.array([MASS, A]), values)
 
     def body(k, x):
-        return flow(x, Span(start + k * step, step, inputs[jnp.minimum(k, len(inputs) - 1)][None]))
+        return flow(x, Span(start + k * step, step, inputs[jnp.minimum(k, len(inputs) - 1)][None], jnp.asarray(1)))
 
     return jax.lax.fori_loop(0, count, body, x)
 

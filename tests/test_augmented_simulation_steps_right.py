@@ -54,7 +54,7 @@ def test_known_forces_with_inputs_and_momenta_are_added():
     # The force of the momentum is split in at order two: 1e-4 times a tenth of it.
     np.testing.assert_allclose(found, x, atol=2e-6)
     one = SimulatedFlow(DRIVEN, LEAPFROG, jnp.array([MASS, A]), jnp.zeros(DRIVEN.size))
-    span = Span(jnp.asarray(0.0), jnp.asarray(0.01), jnp.asarray(inputs))
+    span = Span(jnp.asarray(0.0), jnp.asarray(0.01), jnp.asarray(inputs), jnp.asarray(300))
     # A span of many substeps is as many spans of one: round-off.
     np.testing.assert_allclose(one(jnp.asarray(widened(START)), span)[::2], found, atol=1e-12)
 

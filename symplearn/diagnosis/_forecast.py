@@ -118,8 +118,7 @@ def _run_draws(equations: Any, integrator: Any, course: Any, zs: Array, fixed: A
 
         def step(x: Array, row: tuple[Span, Array, Array, Array]) -> tuple[Array, Array]:
             span, t, u, push = row
-            length = span.step * span.inputs.shape[0]
-            x = flow(x, span).at[equations.momentum].add(jnp.sqrt(intensity * length) * push)
+            x = flow(x, span).at[equations.momentum].add(jnp.sqrt(intensity * span.length) * push)
             return x, read(x, (t, u))
 
         return jax.lax.scan(step, x, (spans, times, inputs, pushes))[1]

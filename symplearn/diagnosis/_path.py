@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._augmented_flow import Span
 from .._augmented_system import EVERYTHING, Switches
 from ._trajectory import Course, effect_coefficients, model_at
 
@@ -44,25 +45,29 @@ def linearise(
     equations, integrator, course: Course, path, calibrated, slots, onehot, readings, switches: Switches = EVERYTHING
 ) -> Linear:
     """Linearise flow and observation about a path (time, state) at theta = [calibrated, slots]."""
+    state, f = path.shape[1], calibrated.shape[0]
     theta = jnp.concatenate([calibrated, slots])
-    f = calibrated.shape[0]
-
-    def flow_and_read(x, theta, k):
-        found = effect_coefficients(theta[f:], onehot)
-        flow, read = model_at(equations, integrator, course, theta[:f], found, switches)
-        span = jax.tree.map(lambda leaf: leaf[k], course.spans)
-        return flow(x, span), read(x, (course.times[k], course.inputs[k]))
+    directions = jnp.eye(state + theta.shape[0])
 
     def row(x, k):
-        values = flow_and_read(x, theta, k)
-        slopes = jax.jacfwd(flow_and_read, argnums=(0, 1))(x, theta, k)
-        return values, slopes
+        def flow_and_read(joint):
+            x, theta = joint[:state], joint[state:]
+            found = effect_coefficients(theta[f:], onehot)
+            flow, read = model_at(equations, integrator, course, theta[:f], found, switches)
+            start, step, inputs = (leaf[k] for leaf in (course.spans.start, course.spans.step, course.spans.inputs))
+            # One number of substeps for all rows, which are stepped together.
+            span = Span(start, step, inputs, course.spans.pieces[0])
+            return flow(x, span), read(x, (course.times[k], course.inputs[k]))
+
+        slope = lambda along: jax.jvp(flow_and_read, (jnp.concatenate([x, theta]),), (along,))  # noqa: E731
+        return jax.vmap(slope, out_axes=(None, -1))(directions)
 
     n = path.shape[0]
-    (moved, h), ((A, T), (H, G)) = jax.vmap(row)(path, jnp.arange(n))
+    (moved, h), (flown, shown) = jax.vmap(row)(path, jnp.arange(n))
     after = jnp.concatenate([path[1:], moved[-1:]])
     seen = ~jnp.isnan(readings)
     residual = jnp.where(seen, jnp.where(seen, readings, 0.0) - h, 0.0)
+    A, T, H, G = flown[..., :state], flown[..., state:], shown[..., :state], shown[..., state:]
     return Linear(moved - after, A, T, residual, H, G)
 
 
@@ -152,7 +157,7 @@ def forward_lanes(
     equations, integrator, course, paths, calibrated, slots, onehots, readings, variances, intensities, switches
 ):
     """Linearise and filter every lane over the leading rows that `paths` (lane, time, state) covers."""
-    lengths = course.spans.step * course.spans.inputs.shape[1]
+    lengths = course.spans.length
     n = paths.shape[1]
 
     def lane(path, c, s, onehot, r, q):

@@ -234,7 +234,7 @@ class Search:
     def _units(self, most: int) -> list[Unit]:
         """What is tried: every effect and target at every place, evenly thinned to at most so many places."""
         out: list[Unit] = []
-        substeps = sum(self.rows) * self.problem.rows[0].spans.inputs.shape[1]
+        substeps = sum(self.rows) * int(self.problem.rows[0].spans.pieces[0])
         load = substeps * (1 if self.problem.equations.separable else _NONSEPARABLE) / _CHEAP
         most = max(_LEAST, int(most / max(1.0, load)))
         for c in self.problem.searched:

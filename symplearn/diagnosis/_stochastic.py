@@ -27,7 +27,7 @@ class MissingForce(eqx.Module):
     unseen: int = eqx.field(static=True, default=0)
 
     def covariance(self, span: Span) -> Float[Array, "state state"]:
-        t = span.step * span.inputs.shape[-2]
+        t = span.length
         q, w = self.intensity, self.softness
         cross = self._filled(0.5 * w * q * t**2)
         return jnp.block([[self._filled(w**2 * q * t**3 / 3), cross], [cross, self._filled(q * t)]])
