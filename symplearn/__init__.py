@@ -4,6 +4,8 @@ In reading order: recordings and simulation files, models, objectives, fits, for
 report is in `symplearn.report`, which alone needs matplotlib.
 """
 
+from . import _loops as _loops  # isort: split
+
 from ._compare_samplers import Comparison as Comparison
 from ._compare_samplers import compare_samplers as compare_samplers
 from ._constrained_fit import ConstrainedEstimate as ConstrainedEstimate

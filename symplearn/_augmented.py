@@ -12,7 +12,7 @@ from jaxtyping import Array
 from ._effects import CENTRAL, SPRING, Candidate, Effect, PowerForce, vocabulary
 from ._separable import is_separable
 from ._symbolic import derivative, jax_function
-from ._terms import Mechanics
+from ._terms import Further, Mechanics
 
 # Keeps a central force finite where both coordinates are zero; its amplitude is then zero as well.
 _TINY = sympy.Float(1e-100)
@@ -40,6 +40,7 @@ class Equations:
     origin: float  # time that phases inside count from
     declared: int  # coordinates of the file; the others are known hidden oscillators
     jumping: tuple[int, ...]  # coordinates with known impulses
+    further: tuple[Further, ...]  # parameters that the file's terms bring along
     energy: Callable[[Array], Array]
     slope: Callable[[Array], Array]  # dH/dq minus the known forces that no velocity enters
     velocity: Callable[[Array], Array]
@@ -127,6 +128,7 @@ def equations(
         start=known.start,
         origin=known.start if origin is None else origin,
         declared=known.declared,
+        further=tuple(known.further),
         jumping=tuple(place for place, _, _ in known.impulses),
         energy=compiled([energy]),
         slope=compiled([derivative(energy, q) - f for q, f in zip(coordinates, still, strict=True)]),

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .._effects import COORDINATE, PAIR, Candidate
+from .._effects import COORDINATE, OUTLIERS, PAIR, Candidate
 from .._expression import Expression
 from . import _document as document
 from ._along import energy
@@ -59,9 +59,14 @@ class Answer:
         plain = found.of((), "white") or self.before
         self.without = self._outlooks(plain, intensity_of(stepper, plain))
         self.with_ = self._outlooks(self.after, intensity_of(stepper, self.after)) if self.chosen else self.without
-        self.pull = found.of((), "force")
+        self.pull = self._missing_force()
         self.lens = self._lenses(self.pull or self.before)
         self.lens_after = self._lenses(self.after)
+
+    def _missing_force(self) -> Estimate | None:
+        """The simulation without effects beside a missing force, with outliers taken out where there were some."""
+        bare = [c for c in self.found.estimates if all(self.problem.candidate(m).effect is OUTLIERS for m in c)]
+        return next((e for c in sorted(bare, key=len) if (e := self.found.of(c, "force"))), None)
 
     def _inflation(self) -> float:
         """How much the evidence of the likeliest answer claims too much."""
@@ -107,15 +112,15 @@ class Answer:
         )
 
     @cached_property
+    def told(self) -> dict[int, dict[str, Any]]:
+        """The coefficients of every finding that has a name, by member."""
+        named = [m for m in self.after.combination if not self.problem.candidate(m).terms]
+        return {m: coefficients(self.problem, self.found.priors, self.after, m, self._spread()) for m in named}
+
+    @cached_property
     def values(self) -> dict[int, dict[str, float]]:
-        """Point values of the coefficients of every finding, by member."""
-        out = {}
-        for member in self.after.combination:
-            if self.problem.candidate(member).terms:
-                continue
-            told = coefficients(self.problem, self.found.priors, self.after, member, self._spread())
-            out[member] = {name: one["mean"] for name, one in told.items()}
-        return out
+        """Point values of those coefficients."""
+        return {m: {name: one["mean"] for name, one in told.items()} for m, told in self.told.items()}
 
     @cached_property
     def expressions(self) -> dict[int, Expression]:
@@ -193,11 +198,7 @@ class Answer:
     def _finding(self, member: int) -> dict[str, Any]:
         p, one = self.posterior, self.problem.candidate(member)
         rest = tuple(c for c in self.after.combination if c != member)
-        told: dict[str, Any] = {}
-        if one.terms:
-            told["expression"] = self.expressions[member].text
-        else:
-            told = coefficients(self.problem, self.found.priors, self.after, member, self._spread())
+        told = {"expression": self.expressions[member].text} if one.terms else self.told[member]
         which = [r + 1 for r in self.problem.members[member].recordings]
         only = None if len(which) == len(self.recordings) else which
         f = self.file
@@ -223,7 +224,7 @@ class Answer:
         return document.finite(mine - without)
 
     def _strength(self, member: int) -> float | None:
-        """Root mean square of an effect's force over that of the forces already there; None where it is no force."""
+        """An effect's amplitudes by their prior's scales, in shares of the forces already there; None for no force."""
         one, place = self.problem.candidate(member), dict(self.problem.placed(self.after.combination))[member]
         if one.effect.acts_on != COORDINATE:
             return None

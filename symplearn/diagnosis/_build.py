@@ -172,11 +172,10 @@ def _bounds(quantity: Quantity) -> tuple[float, float]:
 
 def _values(file: SimulationFile, built: Equations, recordings: int) -> tuple[np.ndarray, np.ndarray, Calibrated]:
     """Parameters and coefficients of known terms by recording, and everything that is calibrated."""
-    further = mechanics(file, built.start).further
     listed = [(name, quantity) for name, quantity in file.parameters.items()]
-    listed += [(one.name, one.quantity) for one in further]
+    listed += [(one.name, one.quantity) for one in built.further]
     parameters = np.tile([q.value for _, q in listed], (recordings, 1)).reshape(recordings, -1)
-    for k, one in enumerate(further, start=len(file.parameters)):
+    for k, one in enumerate(built.further, start=len(file.parameters)):
         parameters[:, k] *= _mask(one.recordings, recordings)
     everywhere = np.ones(recordings)
     free = [(n, i, q, everywhere) for i, (n, q) in enumerate(listed) if not q.known]

@@ -41,7 +41,7 @@ def searched(
     seeds = first_fits(stepper, priors_without_effects(problem), rows_fitted(problem.rows))
     finer, substep = refined(rebuild, problem, seeds.z[0], seeds.noise[0], substep)
     stepper = stepper if finer is problem else Stepper(finer, options.jobs)
-    search = Search(stepper, seeds.z[0], deadline, options.progress)
+    search = Search(stepper, seeds.z, deadline, options.progress)
     found = search.run()
     best = max((e for es in found.estimates.values() for e in es), key=lambda e: e.log_evidence)
     if np.isfinite(best.log_evidence):
@@ -66,7 +66,7 @@ def _with_unnamed(
     outlooks = [Outlook(stepper, pull, r, pull.intensity) for r in range(len(recordings))]
     if not all(o.ok for o in outlooks):
         return found, stepper
-    listed = proposals(file, outlooks, strained_coordinates(outlooks))
+    listed = proposals(file, outlooks, strained_coordinates(outlooks))[: MOST - len(search.base)]
     if not listed:
         return found, stepper
     first, middle = float(recordings[0].times[0]), float(np.mean(recordings[0].times[[0, -1]]))

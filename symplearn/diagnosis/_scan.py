@@ -8,9 +8,10 @@ amplitude zero, so it is tried on a grid; the best places are where fits begin.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .. import _effects as effects
 from .._effects import Candidate, Oscillating
@@ -173,12 +174,14 @@ def scan(
     """Starts of `combination` with one further effect each, the best places of every effect and target."""
     lanes = list(packed(problem, units))
     found: dict[int, list[tuple[float, Start]]] = {}
+    nuisances: dict[int, _Nuisance] = {}
     for a in range(0, len(lanes), LANES):
         some = lanes[a : a + LANES]
         for group, by_unit in zip(some, grams(some), strict=True):
             for unit, by_recording in zip(group, by_unit, strict=True):
                 for member in _members(problem, unit, combination):
-                    start = _scored(problem, by_recording, z, combination, priors, unit, member)
+                    others = _nuisance(problem, by_recording, z, combination, priors, member, nuisances)
+                    start = _scored(problem, by_recording, z, combination, priors, unit, member, others)
                     if start is not None:
                         found.setdefault(member, []).append((0.0 if unit.place is None else unit.place, start))
     return [start for listed in found.values() for start in _peaks(listed)]
@@ -193,42 +196,78 @@ def _members(problem: Problem, unit: Unit, combination: Combination) -> list[int
     return [m for m in members if problem.is_possible((*combination, m))]
 
 
+class _Nuisance(NamedTuple):
+    """Everything but an effect's amplitudes, at its best without them."""
+
+    active: Bool[np.ndarray, " z"]
+    inverse: Float[np.ndarray, "active active"]
+    vector: Float[np.ndarray, " active"]
+
+
+def _nuisance(
+    problem: Problem, by_recording: Sequence[np.ndarray], z, combination: Combination, priors: Priors, member: int,
+    kept: dict[int, _Nuisance],
+) -> _Nuisance:  # fmt: skip
+    """The same for every effect, but for an unseen oscillator, whose start is unknown too."""
+    unseen = problem.candidate(member).effect is effects.HIDDEN
+    if not unseen and kept:
+        return kept[0]
+    n = problem.slots
+    active = problem.active((member,))[:n]
+    gram = np.zeros((1 + n, 1 + n))
+    for r, own in enumerate(by_recording):
+        place = np.concatenate([[0], 1 + _own(problem, r)])
+        gram[np.ix_(place, place)] += own[: len(place), : len(place)]
+    precision = priors.precision_of(problem, (member,))[:n]
+    vector = gram[0, 1:] - precision * (z - priors.mean_of(problem, combination))[:n]
+    inverse = _inverse(gram[1:, 1:][np.ix_(active, active)] + np.diag(precision[active]))
+    found = _Nuisance(active, inverse, vector[active])
+    if not unseen:
+        kept[0] = found
+    return found
+
+
+def _own(problem: Problem, recording: int) -> np.ndarray:
+    """Entries of z that one recording depends on beside the values of effects."""
+    return problem.local(recording)[: problem.state + problem.calibrated.size]
+
+
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    """The inverse; NaN where there is none. A direction that nothing holds keeps a wide, finite spread."""
+    if not np.isfinite(matrix).all():
+        return np.full_like(matrix, np.nan)
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    return (vectors / np.maximum(values, 1e-13)) @ vectors.T / np.outer(scale, scale)
+
+
 def _scored(
     problem: Problem, by_recording: Sequence[np.ndarray], z, combination: Combination, priors: Priors, unit: Unit,
-    member: int,
+    member: int, others: _Nuisance,
 ) -> Start | None:  # fmt: skip
     """The step that a unit's amplitudes and everything else would take, and what it gains."""
     one, n = problem.candidate(member), problem.slots
-    size = 1 + n + one.effect.amplitudes
-    gram = np.zeros((size, size))
-    for r, own in enumerate(by_recording):
-        place = np.concatenate(
-            [[0], 1 + problem.local(r)[: problem.state + problem.calibrated.size], np.arange(1 + n, size)]
-        )
-        present = np.ones(len(place))
-        if r not in problem.members[member].recordings:
-            present[-one.effect.amplitudes :] = 0.0
-        gram[np.ix_(place, place)] += own * np.outer(present, present)
+    number = one.effect.amplitudes
+    cross, square, vector = np.zeros((n, number)), np.zeros((number, number)), np.zeros(number)
+    for r in problem.members[member].recordings:
+        own, gram = _own(problem, r), by_recording[r]
+        k = 1 + len(own)
+        cross[own] += gram[1:k, k:]
+        square, vector = square + gram[k:, k:], vector + gram[0, k:]
+    cross = cross[others.active]
+    scales = priors.scales[one.first : one.first + number]
+    after = others.inverse @ cross  # how the others follow a unit of each amplitude
+    # What the others can take over wholly leaves a difference of round-off, not less than nothing.
+    left = square - cross.T @ after + np.diag(scales**-2.0 + 1e-12 * np.diag(square))
+    spread = _inverse(left)
+    push = vector - after.T @ others.vector
+    amplitudes = spread @ push
+    if not np.isfinite(amplitudes).all() or (one.effect.positive and amplitudes[0] < 0):
+        return None
+    gain = 0.5 * push @ amplitudes + 0.5 * np.linalg.slogdet(spread)[1] - np.log(scales).sum()
     larger = tuple(sorted((*combination, member)))
-    active = problem.active((member,))[:n]
-    precision = priors.precision_of(problem, (member,))[:n]
-    scales = priors.scales[one.first : one.first + one.effect.amplitudes]
-    a = np.concatenate([np.nonzero(active)[0], n + np.arange(len(scales))])
-    matrix = gram[1:, 1:][np.ix_(a, a)] + np.diag(np.concatenate([precision[active], scales**-2.0]))
-    vector = gram[0, 1:][a]
-    vector[: active.sum()] -= (precision * (z - priors.mean_of(problem, combination))[:n])[active]
-    k = int(active.sum())
-    before = _solved(matrix[:k, :k], vector[:k])
-    after = _solved(matrix, vector)
-    if before is None or after is None:
-        return None
-    gain = after[1] - before[1] - np.log(scales).sum()
-    step = after[0]
-    amplitudes = step[k:]
-    if one.effect.positive and amplitudes[0] < 0:
-        return None
     begin = z.copy()
-    begin[:n][active] += step[:k]
+    begin[:n][others.active] += others.inverse @ others.vector - after @ amplitudes
     begin[n:] = 0.0
     return Start(larger, _placed(problem, z, begin, combination, larger, member, amplitudes, unit), float(gain))
 
@@ -242,18 +281,6 @@ def _placed(problem, z, begin, combination, larger, member, amplitudes, unit: Un
         else:
             begin[place] = z[old[m]]
     return begin
-
-
-def _solved(matrix: np.ndarray, vector: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Newton's step, and half of what it takes off less half the log determinant."""
-    if not (np.isfinite(matrix).all() and np.isfinite(vector).all()):
-        return None
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    values = np.maximum(values, 1e-13)
-    along = vectors.T @ (vector / scale)
-    step = vectors @ (along / values) / scale
-    return step, float(0.5 * (along**2 / values).sum() - 0.5 * np.log(values).sum() - np.log(scale).sum())
 
 
 def _peaks(listed: list[tuple[float, Start]]) -> list[Start]:

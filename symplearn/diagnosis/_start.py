@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ._along import along_all, force
-from ._calibrate import Fits, Priors, calibrate, grow
+from ._calibrate import Fits, Priors, calibrate, grow, residuals, weights
 from ._effect_priors import rms
 from ._problem import Problem
 from ._trajectory import Stepper
@@ -63,9 +63,24 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
     z[:, : problem.head] += np.where(unknown, noise, given * noise / spread[:, None])
     tight = _tightened(problem, priors)
     fits = calibrate(stepper, z, [()] * _STARTS, tight, short[0], 40)
-    fits = grow(stepper, fits.z, fits.combinations, priors, short[1:])
+    fits = grow(stepper, _recombined(problem, fits, short[0]), fits.combinations, priors, short[1:])
     order = np.argsort(np.where(np.isfinite(fits.cost), _likelihood(problem, fits, short[-1]), np.inf))
     return Fits([()] * _STARTS, fits.z[order], fits.noise[order], [], fits.cost[order], fits.converged[order])
+
+
+def _recombined(problem: Problem, fits: Fits, rows: Sequence[int]) -> Float[np.ndarray, "lane z"]:
+    """Lanes of which the first begins every recording where that one is followed best, the next one second best..."""
+    weight = weights(problem, rows)
+    z = fits.z.copy()
+    for r, (x, w) in enumerate(zip(residuals(problem, fits.predictions, weight), weight, strict=True)):
+        number = (w > 0).sum(0)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            misfit = (number * np.log((w * x**2).sum(1) / np.maximum(number, 1))).sum(1)
+        order = np.argsort(np.where(np.isnan(misfit), np.inf, misfit))
+        # The calibrated values, which were hardly free yet, come with the first recording.
+        own = slice(r * problem.state, (r + 1) * problem.state if r else problem.size)
+        z[:, own] = fits.z[order, own]
+    return z
 
 
 def _tightened(problem: Problem, priors: Priors) -> Priors:
