@@ -73,6 +73,7 @@ def test_an_escaping_trajectory_names_the_step():
     assert "FAILED at reading 3: the dynamics gave a state that is not finite" in str(found)
 
 
+@pytest.mark.slow
 def test_a_reading_a_million_standard_deviations_away_is_scored_and_noted():
     """The log density is the Gaussian's own -(1e6)^2 / 2, its gradient finite, and the flag tells the step."""
     still = eqx.tree_at(lambda m: m.dynamics, escaping(0.0, process=0.0), LinearDynamics(jnp.eye(1)))
@@ -191,7 +192,7 @@ def never_nan(kind, examples):
     check()
 
 
-@pytest.mark.parametrize("kind", MODELS)
+@pytest.mark.parametrize("kind", ["linear", *(pytest.param(k, marks=pytest.mark.slow) for k in [*MODELS][1:])])
 def test_random_models_never_give_nan(kind):
     """Models and recordings of any numbers, infinite ones among them: finite value, finite gradients, or a fault."""
     never_nan(kind, 150)

@@ -283,6 +283,7 @@ def test_not_all_noise_is_booked_as_process_noise():
     assert 0.25 < found.values()["measurement_noise.structure.variance"] / expected < 4.0
 
 
+@pytest.mark.slow
 def test_a_linear_map_starts_at_the_rows():
     """Of nearly exact readings of the linear pendulum, `learn` from A = 0 finds what a start at the truth finds."""
     times = np.linspace(0.0, 4.0, 25)

@@ -138,6 +138,7 @@ def test_missing_readings_are_left_out_of_both():
     assert -float(filtered(model, series)) == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_both_forms_have_one_gradient():
     """Derivatives by A, B, H and D agree, so that both forms have the same maximum."""
     system, ys, us = random_system(SIZES[1], False)

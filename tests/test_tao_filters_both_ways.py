@@ -116,7 +116,7 @@ def _linear_case(projection, draws):
 
 @pytest.mark.parametrize(
     ("projection", "draws"),
-    [(ig.MeanOfCopies(), None), (ig.FirstCopy(), IndependentDraws())],
+    [pytest.param(ig.MeanOfCopies(), None, marks=pytest.mark.slow), (ig.FirstCopy(), IndependentDraws())],
     ids=["mean-shared", "first-independent"],
 )
 def test_on_a_linear_system_it_is_the_kalman_filter_of_the_doubled_matrices(projection, draws):

@@ -201,6 +201,7 @@ def test_what_cannot_be_done_is_refused():
         GaussHermite(1)
 
 
+@pytest.mark.slow
 def test_derivatives_pass_through_every_transform():
     """The likelihood's gradient agrees with central differences under each transform."""
     ys = jnp.asarray(readings())

@@ -148,6 +148,7 @@ def scored(vector, ys):
 FORWARD = jax.jit(jax.vmap(lambda v, ys: (scored(v, ys), jax.jacfwd(scored)(v, ys)), in_axes=(0, None)))
 
 
+@pytest.mark.slow
 def test_derivatives_are_finite_differences_in_both_modes():
     """Forward and reverse derivatives agree with central differences, missing rows included."""
     ys = pendulum_readings()
