@@ -26,8 +26,6 @@ from ._trajectory import courses
 
 # Substeps per shortest period of the motion to begin with; the search refines it by doubling.
 SUBSTEPS = 8
-# Tao's binding turns the copies by this angle per substep; far larger ones make the composition lose its order.
-_BINDING = 0.2
 # Substeps are fine enough when halving them changes no reading by more than this share of its noise.
 _CHANGE = 0.02
 _HALVINGS = 5
@@ -107,10 +105,9 @@ def build(
     # A prior of the initial state belongs to the first row, which must then stay.
     rows = tuple(lay_out(recordings, holdout, bin_width(recordings), substep, shorten=not file.initial))
     parameters, known, calibrated = _values(file, built, len(recordings))
-    used = max(float(np.max(r.spans.step)) for r in rows)
     return Problem(
         equations=built,
-        integrator=_integrator(file, built, used),
+        integrator=_integrator(file, built),
         rows=rows,
         parameters=parameters,
         terms=known,
@@ -141,11 +138,15 @@ def _is_open(file: SimulationFile, candidate: Candidate) -> bool:
     return quantity.value != 0 and (quantity.known or candidate.effect is not ERROR)
 
 
-def _integrator(file: SimulationFile, built: Equations, substep: float) -> ig.AbstractIntegrator:
-    """The file's symplectic method; the flow composes it to order 4, so that its error stays below what is sought."""
+def _integrator(file: SimulationFile, built: Equations) -> ig.AbstractIntegrator:
+    """The file's symplectic method; the flow composes it to order 4, so that its error stays below what is sought.
+
+    Tao's copies are joined after every substep, so that nothing need bind them; a binding strong enough to be felt
+    within a substep takes the composition's order.
+    """
     if file.integrator.name != "tao" and built.separable:
         return ig.Leapfrog()
-    return ig.Tao(omega=jnp.asarray(_BINDING / substep))
+    return ig.Tao(omega=jnp.asarray(0.0))
 
 
 def _initial(file: SimulationFile, built: Equations) -> InitialPrior:

@@ -11,6 +11,7 @@ from .._simulation_records import SimulationFile
 from ._build import augmented_equations, build, first_substep, refined, rows_fitted
 from ._found import Found
 from ._locate import strained_coordinates
+from ._null_paths import rough_noise
 from ._options import Options
 from ._outlook import Outlook
 from ._posterior import CONSISTENT, Posterior, posterior
@@ -20,6 +21,8 @@ from ._start import first_fits, priors_without_effects
 from ._trajectory import Stepper
 from ._unnamed import proposals
 
+# Third differences show the noise and some of the motion: the share of them that counts as noise at least.
+_ROUGH = 0.3
 # A remainder is clear that stands this many nats above white noise.
 _CLEAR = 5.0
 
@@ -39,7 +42,9 @@ def searched(
     stepper = Stepper(problem, options.jobs)
     options.progress("finding where the motion starts")
     seeds = first_fits(stepper, priors_without_effects(problem), rows_fitted(problem.rows))
-    finer, substep = refined(rebuild, problem, seeds.z[0], seeds.noise[0], substep)
+    # A few rows are fitted too well to tell the noise; where it is still too small, the search only takes longer.
+    noise = np.maximum(seeds.noise[0], _ROUGH * rough_noise(problem, rows_fitted(problem.rows)))
+    finer, substep = refined(rebuild, problem, seeds.z[0], noise, substep)
     stepper = stepper if finer is problem else Stepper(finer, options.jobs)
     search = Search(stepper, seeds.z, deadline, options.progress)
     found = search.run()

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .._effects import OUTLIERS, Candidate
+from .._effects import NOISE, OUTLIERS, Candidate
 from ._calibrate import Fits, estimate_noise, residuals, weights
 from ._effect_priors import motion_along, with_effects, with_unnamed
 from ._found import Found
@@ -23,6 +23,8 @@ from ._weigher import KEPT, Weigher
 _REACH = 30.0
 # Combinations that are extended, most larger ones that are fitted, and what a larger one must gain to go on.
 _BASES, _PAIRS, _WORTH = 4, 24, 2.0
+# Nats by which a missing force may lead for effects to count as small, and how many of those are then fitted.
+_QUIET, _SMALL = 0.0, 24
 # Combinations that a missing force is tried beside.
 _FORCED = 6
 # Combinations that are fitted between two looks at the clock.
@@ -72,10 +74,11 @@ class Search:
                 break
             number = len({start.combination for start in starts})
             self.progress(f"weighing {number} {'single effects' if size == 1 else f'combinations of {size} effects'}")
+            near = self._is_near(size - 1)
             # The first single effects are weighed however little time is given.
             for a in range(0, len(starts), _BATCH):
                 if (size == 1 and a == 0) or self._in_time():
-                    self.weigher.weigh(starts[a : a + _BATCH])
+                    self.weigher.weigh(starts[a : a + _BATCH], whole=near)
             if size > 1 and not self._gained(size):
                 break
         self._move_places()
@@ -220,6 +223,8 @@ class Search:
 
     def _singles(self) -> list[Start]:
         """Every effect that has no place from zero, in a growing window; the others from where they promise most."""
+        if self._is_near(0):
+            return self._small_singles()
         problem, zero = self.problem, self._from_seed()
         plain = [c for c in problem.searched if not problem.candidate(c).effect.places]
         starts = [Start(self._with(c), zero, 0.0) for c in plain if problem.candidate(c).effect is not OUTLIERS]
@@ -235,6 +240,21 @@ class Search:
         part = [s for s in found if not self._new(s).effect.places and s.gain > top - _REACH
                 and not set(s.combination) <= {*problem.searched, *self.base}]  # fmt: skip
         return starts + placed + sorted(part, key=lambda s: -s.gain)[:_PAIRS]
+
+    def _is_near(self, size: int) -> bool:
+        """Whether the best of a size nearly follows the recording, so that one effect more is small, and a fit may
+        begin with all rows from where its score puts it."""
+        whites = [self.found.of(c, "white") for c in self.found.estimates if self._size(c) == size]
+        top = max((e.log_evidence for e in whites if e is not None and e.converged), default=-np.inf)
+        return top > self._null.log_evidence - (_QUIET if size == 0 else _REACH)
+
+    def _small_singles(self) -> list[Start]:
+        """The effects of the highest scores, from where those put them."""
+        white, problem = self.found.of(self.base, "white"), self.problem
+        assert white is not None
+        found = sorted(self._scanned(self.base, white.z, _MANY), key=lambda start: -start.gain)
+        unscored = [c for c in problem.searched if problem.candidate(c).effect is NOISE]
+        return [Start(self._with(c), white.z, 0.0) for c in unscored] + found[:_SMALL]
 
     def _with(self, member: int) -> Combination:
         return tuple(sorted((*self.base, member)))

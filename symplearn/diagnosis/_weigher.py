@@ -22,6 +22,8 @@ _GROWTH = (0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.0)
 # Substeps over all rows beyond which the search is narrowed before the whole recording is used, and to how many.
 _AFFORDABLE = 12_000
 KEPT = 8
+# Nats behind the best after most of the rows that no effect catches up in the rest.
+_BEHIND = 40.0
 
 
 class Weigher:
@@ -83,15 +85,25 @@ class Weigher:
         priors = self.found.priors
         if cut < len(growing) and len(candidates) > KEPT:
             fits = grow(self.stepper, z, candidates, priors, growing[:cut], final=20, held=held)
-            values = [e.log_evidence for e in weigh_white(self.problem, fits, priors, growing[cut - 1])]
+            values = self._whites(fits, growing[cut - 1])
             kept = [int(k) for k in np.argsort(values)[::-1]][:KEPT]
             z, candidates, held, growing = fits.z[kept], [candidates[k] for k in kept], held[kept], growing[cut:]
+        elif len(growing) > 1 and len(candidates) > KEPT:
+            # Who is far behind after most of the rows is not fitted to all of them, unless its time may yet come.
+            fits = grow(self.stepper, z, candidates, priors, growing[:-1], final=12, held=held)
+            values = self._whites(fits, growing[-2])
+            kept = [int(k) for k in np.nonzero(held | (values >= np.nanmax(values) - _BEHIND))[0]]
+            z, candidates, held, growing = fits.z[kept], [candidates[k] for k in kept], held[kept], growing[-1:]
         fits = grow(self.stepper, z, candidates, priors, growing, held=held)
         for b, estimate in enumerate(weigh_white(self.problem, fits, priors, self.rows)):
             self._add(estimate, *self._outliers(fits, b))
         for estimate in weigh_coloured(self.problem, fits, priors, self.rows):
             white = self.found.of(estimate.combination, "white")
             self._add(estimate, self.owed[estimate.combination], white.outliers if white else ())
+
+    def _whites(self, fits: Fits, rows: list[int]) -> np.ndarray:
+        """Log evidences under white noise, by lane."""
+        return np.array([e.log_evidence for e in weigh_white(self.problem, fits, self.found.priors, rows)])
 
     def _add(self, estimate: Estimate, value: float, told: tuple[tuple[float, float], ...]) -> None:
         self.owed[estimate.combination] = value
