@@ -27,7 +27,7 @@ class Effect:
     """One word of the vocabulary.
 
     **Arguments:** - `amplitudes`: how many of its values are amplitudes. - `places`: names of the values that follow.
-    - `positive`: whether only a positive first amplitude is physical. - `switched`: whether a further entry of the
+    - `positive`: whether only positive amplitudes are physical. - `switched`: whether a further entry of the
     coefficient vector is 1 where the effect is present, which its amplitudes cannot tell.
     """
 
@@ -146,7 +146,7 @@ POWERS = (
     PowerForce("quadratic_stiffness", power=2),
     PowerForce("cubic_stiffness", power=3),
 )
-EXCITATION = SelfExcitation("self_excitation", amplitudes=2)
+EXCITATION = SelfExcitation("self_excitation", amplitudes=2, positive=True)  # else no a is real, or it is a damping
 STOP = Effect("contact_stop", places=("a",), positive=True)
 FORCING = Oscillating("periodic_forcing", amplitudes=2, places=("omega",))
 IMPULSE = Effect("impulse", places=("t_star",))

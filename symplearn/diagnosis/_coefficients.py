@@ -82,9 +82,11 @@ def _drawn(problem: Problem, priors: Priors, estimate: Estimate, place: slice, i
         for mode, number in zip(modes, numbers, strict=True)
     ])  # fmt: skip
     lower, upper = priors.bounds_of(problem, estimate.combination)
-    bound = problem.lower_bounds(estimate.combination).get(place.start, -np.inf)
+    signed = problem.lower_bounds(estimate.combination)
+    bound = np.array([signed.get(k, -np.inf) for k in range(place.start, place.stop)])
     draws = np.clip(draws, lower[place], upper[place])
-    return draws[draws[:, 0] >= bound] if (draws[:, 0] >= bound).sum() > _DRAWS // 20 else draws
+    allowed = (draws >= bound).all(1)
+    return draws[allowed] if allowed.sum() > _DRAWS // 20 else draws
 
 
 def _summary(value: float, draws: np.ndarray, circular: bool) -> dict[str, Any]:

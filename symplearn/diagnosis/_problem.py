@@ -203,4 +203,8 @@ class Problem:
     def lower_bounds(self, combination: Sequence[int]) -> dict[int, float]:
         """Entries of z that are physical above a bound only: a drag adds up to at least nothing with its known term."""
         signed = [(m, place) for m, place in self.placed(combination) if self.candidate(m).effect.positive]
-        return {place.start: -float(self.terms[:, self.candidate(m).first].min()) for m, place in signed}
+        return {
+            place.start + k: -float(self.terms[:, self.candidate(m).first + k].min())
+            for m, place in signed
+            for k in range(self.candidate(m).effect.amplitudes)
+        }

@@ -264,6 +264,8 @@ def _scored(
     amplitudes = spread @ push
     if not np.isfinite(amplitudes).all() or (one.effect.positive and amplitudes[0] < 0):
         return None
+    if one.effect.positive:
+        amplitudes = np.maximum(amplitudes, 0.0)
     gain = 0.5 * push @ amplitudes + 0.5 * np.linalg.slogdet(spread)[1] - np.log(scales).sum()
     larger = tuple(sorted((*combination, member)))
     begin = z.copy()
