@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
@@ -21,10 +22,15 @@ def real_case(name: str, recording: str = "recording.csv") -> tuple[Path, Path]:
     missing = [path for path in paths if not path.is_file()]
     if missing:
         sentence = f"no real recording at {missing[0]}; set SYMPLEARN_RECORDINGS to the folder that holds {name}"
-        if os.environ.get("SYMPLEARN_REQUIRE_RECORDINGS") == "1":
-            pytest.fail(sentence)
-        pytest.skip(sentence)
+        absent(sentence)
     return paths
+
+
+def absent(sentence: str) -> NoReturn:
+    """Say that a recording is missing: skip the test, or fail where `SYMPLEARN_REQUIRE_RECORDINGS` is 1."""
+    if os.environ.get("SYMPLEARN_REQUIRE_RECORDINGS") == "1":
+        pytest.fail(sentence)
+    pytest.skip(sentence)
 
 
 def document_of(name: str, recording: str = "recording.csv") -> dict:

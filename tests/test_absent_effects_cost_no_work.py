@@ -24,6 +24,7 @@ def test_switching_off_what_is_absent_changes_nothing(built, method):
     assert np.abs(full - x).max() > 0.1
     context = jnp.asarray(1.2), jnp.zeros(0)
     full, less = (SimulatedReading(built, *numbers, *s)(x, context) for s in ((), (WITHOUT,)))
+    # A delay of nothing goes back by nothing: round-off.
     np.testing.assert_allclose(less, full, rtol=1e-12)
 
 
@@ -36,6 +37,7 @@ def test_what_is_switched_off_is_not_there(effect, values):
     run = lambda c, *s: SimulatedFlow(SOFT, LEAPFROG, jnp.array([MASS, A]), jnp.asarray(c), *s)(  # noqa: E731
         jnp.asarray(widened(START)), SPAN
     )
+    # Only the compiled order of additions may differ: round-off of fifty substeps.
     np.testing.assert_allclose(run(on, WITHOUT), run(plain), rtol=1e-12)
     assert np.abs(run(on) - run(plain)).max() > 0.05
 
