@@ -13,6 +13,7 @@ from symplearn._augmented_flow import SimulatedFlow, Span
 from symplearn._expression import symbol
 from symplearn._terms import Mechanics
 
+# The two methods a diagnosis steps by.
 LEAPFROG, TAO = ig.PositionVerlet(), ig.Tao(None)
 MASS, A = 2.0, 0.7
 START, PAIR_START = np.array([0.9, 0.8]), np.array([0.9, -0.6, 0.4, 0.8])

@@ -29,24 +29,24 @@ def test_switching_off_what_is_absent_changes_nothing(built, method):
 
 
 @pytest.mark.parametrize(
-    ("effect", "values"),
+    ("effect", "target", "values"),
     [
-        ("coulomb_friction", {"f": 0.3}),
-        ("impulse", {"j": 0.4, "t_star": 0.5}),
-        ("periodic_forcing", {"a": 0.3, "omega": 2.0, "phi": 0.4}),
-        ("parametric_modulation", {"a": 0.3, "omega": 2.0, "phi": 0.4}),
-        ("regime_change", {"d": 0.3, "t_star": 0.5}),
+        ("coulomb_friction", "q", {"f": 0.3}),
+        ("impulse", "q", {"j": 0.4, "t_star": 0.5}),
+        ("periodic_forcing", "q", {"a": 0.3, "omega": 2.0, "phi": 0.4}),
+        ("parametric_modulation", "a", {"a": 0.3, "omega": 2.0, "phi": 0.4}),
+        ("regime_change", "a", {"d": 0.3, "t_star": 0.5}),
     ],
 )
-def test_what_is_switched_off_is_not_there(effect, values):
+def test_what_is_switched_off_is_not_there(effect, target, values):
     """A switch does leave its effects out: the flow is that of the plain simulation."""
-    plain, on = np.zeros(SOFT.size), vector(SOFT, effect, values)
+    plain, on = np.zeros(SOFT.size), vector(SOFT, effect, values, target)
     run = lambda c, *s: SimulatedFlow(SOFT, LEAPFROG, jnp.array([MASS, A]), jnp.asarray(c), *s)(  # noqa: E731
         jnp.asarray(widened(START)), SPAN
     )
     # Only the compiled order of additions may differ: round-off of fifty substeps.
     np.testing.assert_allclose(run(on, WITHOUT), run(plain), rtol=1e-12)
-    assert np.abs(run(on) - run(plain)).max() > 0.005
+    assert np.abs(run(on) - run(plain)).max() > 0.05
 
 
 @pytest.mark.parametrize(

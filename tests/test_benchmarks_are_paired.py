@@ -32,6 +32,7 @@ def test_the_spread_is_that_of_the_order_statistics():
 @pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 3.0])
 def test_growth_is_the_exponent_of_a_power_law(exponent):
     """Along a power law the fitted exponent is its own."""
+    # Round-off of the logarithms, some 4e-15, and of the fit.
     assert growth({n: 7e-9 * n**exponent for n in (10, 100, 1000)}) == pytest.approx(exponent, abs=1e-12)
 
 

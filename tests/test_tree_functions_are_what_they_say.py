@@ -54,7 +54,7 @@ def test_numpy_and_jax_agree(text):
 def test_half_integer_powers_are_powers(exponent):
     """A root and a product, by which they are worked out, give Python's own power."""
     function = jax_function([parsed(f"y**({int(2 * exponent)}/2)")], SYMBOLS)
-    np.testing.assert_allclose(function(POINT)[0], 1.3**exponent, rtol=1e-14)
+    np.testing.assert_allclose(function(POINT)[0], 1.3**exponent, rtol=1e-14)  # round-off of ten products
 
 
 def test_it_lives_in_jit_vmap_jacfwd_and_scan():

@@ -100,6 +100,7 @@ class Search:
         w.add_paths(self.null_paths)
 
     def _follow(self, bare: Priors) -> None:
+        """Paths and trajectories of the simulation as it is, and the priors of effects that its motion sets."""
         w = self.weigher
         self.progress("following the recording with a missing force")
         paths = null_paths(w.stepper, self.seed, self.rows, bare, w.path_steps)

@@ -187,10 +187,11 @@ class Stepper:
         for lane, places in enumerate(along):
             directions[lane, np.arange(len(places)), places] = 1.0
         some, matrices, along_some = (jnp.asarray(a[lanes]) for a in (local_z, hots, directions))
+        last, switches = jnp.asarray(rows), switches_of(p, r, hots)
         parts = [
             _sensitivities(
                 p.equations, p.integrator, self.courses[r], some, matrices, along_some[:, k : k + DIRECTIONS],
-                jnp.asarray(rows), switches_of(p, r, hots),
+                last, switches,
             )
             for k in range(0, width, DIRECTIONS)
         ]  # fmt: skip

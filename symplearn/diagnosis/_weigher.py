@@ -66,6 +66,8 @@ class Weigher:
             far = [self._far(fit, may) for fit in lanes]
             if not any(bad.any() for masks in far for bad in masks):
                 return False
+            if all(map(_are_left_out, lanes, far)):
+                break
             lanes = [replace(fit, left_out=masks, laplace=None) for fit, masks in zip(lanes, far, strict=True)]
             lanes = fit_paths(self.plain, lanes, priors, self.rows, self.path_steps)
         best = max(lanes, key=self._with_outliers)
@@ -210,3 +212,8 @@ class Weigher:
         """How many of the growing windows are affordable for every combination."""
         pieces = int(self.problem.rows[0].spans.pieces[0])
         return max(1, sum(sum(rows) * pieces <= _AFFORDABLE for rows in growing))
+
+
+def _are_left_out(fit: PathFit, masks: Sequence[np.ndarray]) -> bool:
+    """Whether a path was fitted without exactly these readings."""
+    return fit.left_out is not None and all(map(np.array_equal, fit.left_out, masks))
