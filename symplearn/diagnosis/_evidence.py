@@ -88,16 +88,29 @@ def _orthant(reach: np.ndarray, correlation: np.ndarray) -> float:
     if reach.min() >= _FAR:
         joint = multivariate_normal.cdf(reach, cov=correlation, allow_singular=True, rng=np.random.default_rng(0))
         return float(np.log(max(joint, _TINY)))
-    reach, covariance, total = reach.copy(), correlation.copy(), 0.0
-    for i in range(len(reach)):
-        spread = np.sqrt(covariance[i, i])
-        r = reach[i] / spread
-        total += float(norm.logcdf(r))
-        shift = float(np.exp(norm.logpdf(r) - norm.logcdf(r)))
-        with_i = covariance[:, i] / spread
-        reach = reach + with_i * shift
-        covariance = covariance - np.outer(with_i, with_i) * shift * (shift + r)
-        covariance += np.diag(np.maximum(1e-12 - np.diag(covariance), 0.0))
+    return float(orthants(reach, correlation))
+
+
+def orthants(
+    centre: Float[np.ndarray, "*lane n"], covariance: Float[np.ndarray, "*lane n n"]
+) -> Float[np.ndarray, "*lane"]:
+    """Log probabilities that correlated normals are all positive, one after the other given that those before are.
+
+    Exact for one and for independent ones, a good approximation for others (Mendell and Elston 1974).
+    """
+    reach, covariance, total = centre.copy(), covariance.copy(), np.zeros(centre.shape[:-1])
+    diagonal = np.arange(centre.shape[-1])
+    for i in diagonal:
+        spread = np.sqrt(np.maximum(covariance[..., i, i], _TINY))
+        r = reach[..., i] / spread
+        total = total + norm.logcdf(r)
+        shift = np.exp(norm.logpdf(r) - norm.logcdf(r))
+        with_i = covariance[..., i] / spread[..., None]
+        reach = reach + with_i * shift[..., None]
+        less = (shift * (shift + r))[..., None, None]
+        covariance = covariance - with_i[..., :, None] * with_i[..., None, :] * less
+        held = np.maximum(covariance[..., diagonal, diagonal], 1e-12)
+        covariance[..., diagonal, diagonal] = held
     return total
 
 

@@ -18,6 +18,7 @@ from .._effects import Candidate, Oscillating
 from ._calibrate import Fits, Priors, residuals, weights
 from ._noisy import PathFit, lane_grams
 from ._problem import SLOTS, Combination, Problem
+from ._strength import mixture_gain
 from ._trajectory import DIRECTIONS, LANES, Stepper
 
 # Places tried for times and thresholds, and the most frequencies; frequencies this many times pi over the span apart.
@@ -36,11 +37,15 @@ class Unit:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where a fit of a combination begins, and the log evidence that it is expected to gain."""
+    """Where a fit of a combination begins, and the log evidence that it is expected to gain.
+
+    `still` is the fit that a score was taken at, where the new effect has no amplitude yet.
+    """
 
     combination: Combination
     z: Float[np.ndarray, " z"]
     gain: float
+    still: Float[np.ndarray, " z"] | None = None
 
 
 def grid(problem: Problem, priors: Priors, candidate: int) -> list[Unit]:
@@ -283,14 +288,21 @@ def _scored(
     amplitudes = spread @ push
     if not np.isfinite(amplitudes).all() or (one.effect.positive and amplitudes[0] < 0):
         return None
+    lowest = np.full(number, 0.0 if one.effect.positive else -np.inf)
     if one.effect.positive:
         amplitudes = np.maximum(amplitudes, 0.0)
     gain = 0.5 * push @ amplitudes + 0.5 * np.linalg.slogdet(spread)[1] - np.log(scales).sum()
+    gain += mixture_gain(amplitudes / scales, spread / np.outer(scales, scales), np.zeros(number, int), lowest / scales)
     larger = tuple(sorted((*combination, member)))
     begin = z.copy()
     begin[:n][others.active] += others.inverse @ others.vector - after @ amplitudes
     begin[n:] = 0.0
-    return Start(larger, _placed(problem, z, begin, combination, larger, member, amplitudes, unit), float(gain))
+    bare = np.where(np.arange(len(z)) < n, z, 0.0)
+    ends = [
+        _placed(problem, z, at, combination, larger, member, size, unit)
+        for at, size in ((begin, amplitudes), (bare, np.zeros(number)))
+    ]
+    return Start(larger, ends[0], float(gain), ends[1])
 
 
 def _placed(problem, z, begin, combination, larger, member, amplitudes, unit: Unit) -> np.ndarray:

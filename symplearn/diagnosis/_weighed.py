@@ -10,6 +10,7 @@ from ._coloured import Colour, fit_colour, whitened_gram, whitened_series
 from ._evidence import Laplace, laplace, variance_inflation
 from ._problem import Combination, Problem
 from ._scatter import factor_evidence, law_gain
+from ._strength import strength_gain
 from ._trajectory import Stepper
 
 # A remainder of the sensor is smaller than this share of what it reads; else it is the signal.
@@ -64,6 +65,7 @@ def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -
         errors = standardised([x[b] for x in r], weight, fits.noise[b])
         value = _earned(one, fits, b) + law_gain(problem, combination, errors, fits.noise[b])
         value += factor_evidence(problem, combination, fits.noise[b], number)
+        value += strength_gain(problem, combination, priors, fits.z[b] + one.step, one.covariance)
         out.append(
             Estimate(
                 combination,
@@ -133,6 +135,7 @@ def _coloured_estimate(
         noise = np.where(free, np.sqrt(np.maximum(square, 1e-300) / np.maximum(number, 1)), noise)
     z = fits.z[b] + one.step
     value = _earned(one, fits, b) + sum(colour.occam for colour in colours)
+    value += strength_gain(problem, combination, priors, z, one.covariance)
     return Estimate(combination, "coloured", z, one.covariance, noise, value, bool(fits.converged[b]),
                     colours=colours)  # fmt: skip
 

@@ -14,6 +14,7 @@ from ._problem import MOST, Combination, Problem
 from ._scan import Start
 from ._scatter import outlier_evidence, outliers, suspects
 from ._start import windows
+from ._strength import strength_gain
 from ._trajectory import Stepper
 from ._weighed import Estimate, standardised, weigh_coloured, weigh_white
 
@@ -102,9 +103,12 @@ class Weigher:
     def weigh(self, starts: Sequence[Start], whole: bool = False) -> None:
         """Fit and weigh combinations; on a long recording most are dropped after its first part.
 
-        With `whole`, all rows are fitted at once: the starts are good already.
+        With `whole`, all rows are fitted at once: the starts are good already. A score's whole step may lead too far
+        for that; what has no place, which a fit could not find from nothing, begins where the score was taken.
         """
-        z, candidates = np.stack([start.z for start in starts]), [start.combination for start in starts]
+        z = np.stack([start.z if not whole or start.still is None or self._is_placed(start) else start.still
+                      for start in starts])  # fmt: skip
+        candidates = [start.combination for start in starts]
         held = np.array([self._is_held(one) for one in starts])
         growing = self._windows()[-1:] if whole else self._windows()
         cut = len(growing) if whole else self._first_part(growing)
@@ -128,12 +132,19 @@ class Weigher:
             self._add(estimate, self.owed[estimate.combination], white.outliers if white else ())
 
     def _whites(self, fits: Fits, rows: list[int]) -> np.ndarray:
-        """Log evidences under white noise, by lane."""
+        """Log evidences under white noise, by lane, with what unfinished fits promise."""
+        fits = replace(fits, converged=np.ones(len(fits.z), bool))
         return np.array([e.log_evidence for e in weigh_white(self.problem, fits, self.found.priors, rows)])
 
     def _add(self, estimate: Estimate, value: float, told: tuple[tuple[float, float], ...]) -> None:
         self.owed[estimate.combination] = value
         self.found.add(replace(estimate, log_evidence=estimate.log_evidence + value, outliers=told))
+
+    def _is_placed(self, start: Start) -> bool:
+        """Whether the effect that a score added has a place."""
+        assert start.still is not None  # asked of scores only
+        ones = [(self.problem.candidate(m).effect, place) for m, place in self.problem.placed(start.combination)]
+        return any(one.places and not start.still[place][: one.amplitudes].any() for one, place in ones)
 
     def _is_held(self, start: Start) -> bool:
         """Whether effects keep their values in early windows, which say nothing of a late jump or a slow beat."""
@@ -174,7 +185,7 @@ class Weigher:
         """Of the intensities tried for each combination, the best, owing for the choice."""
         for combination in dict.fromkeys(fit.combination for fit in fits):
             mine = [fit for fit in fits if fit.combination == combination]
-            values = np.array([fit.log_evidence for fit in mine])
+            values = np.array([fit.log_evidence + self._strength(fit) for fit in mine])
             if not np.isfinite(values).any():
                 continue
             best = mine[int(np.argmax(values))]
@@ -195,6 +206,12 @@ class Weigher:
                     outliers=white.outliers if white else (),
                 )  # fmt: skip
             )
+
+    def _strength(self, fit: PathFit) -> float:
+        """What a path gains where its effects may be of any order of magnitude."""
+        if fit.laplace is None:
+            return 0.0
+        return strength_gain(self.problem, fit.combination, self.found.priors, fit.z, fit.laplace.covariance)
 
     @property
     def is_long(self) -> bool:

@@ -1,0 +1,93 @@
+"""How strong an effect is: of unknown order of magnitude, from what the recording can just show to as strong as the
+forces that are already there.
+
+A Gaussian prior as wide as the strongest effect makes a small one pay for every order of magnitude that it is smaller,
+and effects of different units pay differently for the same thing. So each effect's prior is a mixture of Gaussians
+whose widths are spread evenly in their logarithm. Fits are made under the widest; the others follow from its posterior.
+"""
+
+import itertools
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import logsumexp
+
+from .._effects import HIDDEN
+from ._calibrate import Priors
+from ._evidence import orthants
+from ._problem import Combination, Problem
+
+# Widths of the mixture, and the narrowest of them in standard deviations of the estimate: an effect that no recording
+# of this kind could show is not what is asked for.
+WIDTHS, _SEEN = 7, 4.0
+# What the recording says of a direction is at least this share of what the prior says.
+_SILENT = 1e-9
+
+
+def strength_gain(
+    problem: Problem, combination: Combination, priors: Priors, z: Float[np.ndarray, " z"],
+    covariance: Float[np.ndarray, "z z"],
+) -> float:  # fmt: skip
+    """Log evidence under unknown orders of magnitude, less that under the widest priors, whose posterior is given."""
+    blocks = [entries for member in combination if len(entries := _entries(problem, combination, member))]
+    if not blocks:
+        return 0.0
+    a, own = np.concatenate(blocks), np.repeat(np.arange(len(blocks)), [len(b) for b in blocks])
+    unit = priors.precision_of(problem, combination)[a] ** -0.5
+    centre = (z - priors.mean_of(problem, combination))[a] / unit
+    spread = covariance[np.ix_(a, a)] / np.outer(unit, unit)
+    bounds = problem.lower_bounds(combination)
+    lowest = np.array([bounds.get(int(k), -np.inf) for k in a]) / unit
+    return mixture_gain(centre, spread, own, lowest)
+
+
+def _entries(problem: Problem, combination: Combination, member: int) -> np.ndarray:
+    """Where in z the amplitudes of one member stand, and the start of what it adds unseen."""
+    place = dict(problem.placed(combination))[member]
+    effect = problem.candidate(member).effect
+    unseen = [problem.unseen(r) for r in problem.members[member].recordings] if effect is HIDDEN else []
+    return np.concatenate([np.arange(place.start, place.start + effect.amplitudes), *unseen]).astype(int)
+
+
+def mixture_gain(
+    centre: Float[np.ndarray, " a"], spread: Float[np.ndarray, "a a"], own: np.ndarray, lowest: Float[np.ndarray, " a"]
+) -> float:
+    """The same for a posterior in units of the widest priors, all of them about zero and of sd one.
+
+    **Arguments:** - `own`: the number of the effect that each entry belongs to. - `lowest`: bounds of the entries.
+    """
+    if not (np.isfinite(centre).all() and np.isfinite(spread).all()):
+        return 0.0
+    values, vectors = np.linalg.eigh(spread)
+    left = np.maximum(1.0 - values, _SILENT)  # what the recording says, as a share of all that is known
+    likelihood = (vectors * (np.maximum(values, 1e-300) / left)) @ vectors.T  # covariance without the priors
+    told = vectors @ ((vectors.T @ centre) / left)
+    shares = [_shares(spread[np.ix_(own == k, own == k)]) for k in range(own[-1] + 1)]
+    widths = np.array(list(itertools.product(*shares)))[:, own]
+    widest = np.ones((1, len(own)))
+    weigh = lambda w: _log_weights(told, likelihood, w, lowest)  # noqa: E731
+    return float(logsumexp(weigh(widths)) - np.log(len(widths)) - weigh(widest)[0])
+
+
+def _shares(spread: Float[np.ndarray, "b b"]) -> np.ndarray:
+    """Widths of one effect's prior, in that of the widest."""
+    values = np.clip(np.linalg.eigvalsh(spread), 1e-300, None)
+    information = float(np.mean(np.maximum(1.0 / values - 1.0, 0.0)))
+    narrowest = _SEEN / np.sqrt(max(information, 1e-300))
+    return np.geomspace(narrowest, 1.0, WIDTHS) if narrowest < 1.0 else np.ones(1)
+
+
+def _log_weights(told: np.ndarray, likelihood: np.ndarray, widths: np.ndarray, lowest: np.ndarray) -> np.ndarray:
+    """Log evidence of every choice of widths, up to one constant."""
+    prior = widths**2
+    total = likelihood + prior[:, :, None] * np.eye(len(told))
+    inverse = np.linalg.inv(total)
+    solved = inverse @ told
+    out = -0.5 * solved @ told - 0.5 * np.linalg.slogdet(total)[1]
+    some = np.isfinite(lowest)
+    if some.any():
+        centre = (prior * solved)[:, some] - lowest[some]
+        covariance = prior[:, :, None] * (inverse @ likelihood)
+        out = out + orthants(centre, covariance[:, some][:, :, some])
+        out = out - orthants(np.broadcast_to(-lowest[some], centre.shape), prior[:, some, None] * np.eye(some.sum()))
+    return out

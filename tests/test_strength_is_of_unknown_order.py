@@ -1,0 +1,92 @@
+"""An effect's strength is of unknown order of magnitude: small ones do not pay for being small, nor units for theirs."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from symplearn.diagnosis._strength import WIDTHS, mixture_gain
+
+NONE = -np.inf
+
+
+def posterior(told, likelihood):
+    """Centre and covariance under priors about zero of sd one."""
+    precision = np.linalg.inv(likelihood)
+    spread = np.linalg.inv(precision + np.eye(len(told)))
+    return spread @ precision @ told, spread
+
+
+@pytest.mark.parametrize(
+    ("sd", "told", "lowest"), [(0.01, 0.05, NONE), (0.1, 0.3, NONE), (1e-3, 0.004, 0.0), (0.1, -0.1, 0.0), (0.1, 0.1, -0.2)]
+)  # fmt: skip
+def test_one_amplitude_is_integrated_as_quadrature_does(sd, told, lowest):
+    """The gain of the mixture is the ratio of two integrals over the amplitude, each by SciPy's quadrature."""
+    widths = np.geomspace(4.0 * sd, 1.0, WIDTHS)
+
+    def evidence(width):
+        prior = stats.truncnorm(lowest / width, np.inf, scale=width)
+        low, high = max(lowest, told - 12 * sd), max(told, lowest) + 12 * sd
+        value, _ = integrate.quad(lambda a: stats.norm.pdf(told, a, sd) * prior.pdf(a), low, high, epsabs=0, limit=300)
+        return value
+
+    centre, spread = posterior(np.array([told]), np.array([[sd**2]]))
+    gain = mixture_gain(centre, spread, np.zeros(1, int), np.array([lowest]))
+    expected = np.log(np.mean([evidence(w) for w in widths]) / evidence(1.0))
+    assert gain == pytest.approx(expected, abs=1e-7)  # quadrature's own 1.5e-8, relative, of either integral
+
+
+def test_two_effects_have_a_width_each():
+    """Of two correlated effects every pair of widths counts: densities of what is told, summed by SciPy."""
+    told = np.array([0.2, -0.03])
+    likelihood = np.array([[4e-3, 6e-4], [6e-4, 1e-3]])
+    centre, spread = posterior(told, likelihood)
+    shares = []
+    for k in range(2):
+        information = 1.0 / spread[k, k] - 1.0  # one entry, the other one left open
+        shares.append(np.geomspace(4.0 / np.sqrt(information), 1.0, WIDTHS))
+    density = lambda a, b: stats.multivariate_normal.pdf(told, cov=likelihood + np.diag([a**2, b**2]))  # noqa: E731
+    expected = np.log(np.mean([density(*pair) for pair in product(*shares)]) / density(1.0, 1.0))
+    gain = mixture_gain(centre, spread, np.arange(2), np.full(2, NONE))
+    assert gain == pytest.approx(expected, abs=1e-10)  # round-off of inverses with condition numbers of some 100
+
+
+def test_the_two_parts_of_one_effect_share_a_width():
+    """A cosine and a sine are as wide as one another: one width for both in every term of the mean."""
+    told, sd = np.array([0.1, 0.05]), 0.01
+    centre, spread = posterior(told, sd**2 * np.eye(2))
+    widths = np.geomspace(4.0 * sd, 1.0, WIDTHS)
+    density = lambda w: stats.norm.pdf(told, scale=np.hypot(w, sd)).prod()  # noqa: E731
+    expected = np.log(np.mean([density(w) for w in widths]) / density(1.0))
+    gain = mixture_gain(centre, spread, np.zeros(2, int), np.full(2, NONE))
+    assert gain == pytest.approx(expected, abs=1e-10)  # round-off
+
+
+def evidence_beside_nothing(sd, told):
+    """Log evidence of one amplitude less that of zero, from Gaussians by hand and the gain under test."""
+    centre, spread = posterior(np.array([told]), np.array([[sd**2]]))
+    widest = stats.norm.logpdf(told, scale=np.hypot(1.0, sd)) - stats.norm.logpdf(told, scale=sd)
+    return widest + mixture_gain(centre, spread, np.zeros(1, int), np.full(1, NONE))
+
+
+def test_the_same_evidence_whatever_the_unit():
+    """Six standard deviations earn nearly the same in an effect of which the widest is 30 or 30,000 times the error.
+
+    With the widest alone the difference would be ln 1000 = 6.9 nats.
+    """
+    coarse, fine = (evidence_beside_nothing(sd, 6 * sd) for sd in (1 / 30, 1 / 30_000))
+    assert abs(coarse - fine) < 2.0
+    assert min(coarse, fine) > 10.0
+
+
+def test_what_is_not_there_still_pays():
+    """An effect estimated at nothing is less likely than nothing, however small it may be."""
+    for sd in (1 / 30, 1 / 30_000):
+        assert evidence_beside_nothing(sd, 0.0) < -1.4
+
+
+def test_what_the_recording_cannot_show_gains_nothing():
+    """Where the estimate is nearly as wide as its prior there are no narrower priors to speak of."""
+    centre, spread = posterior(np.array([0.3]), np.array([[0.5]]))
+    assert mixture_gain(centre, spread, np.zeros(1, int), np.full(1, NONE)) == 0.0
