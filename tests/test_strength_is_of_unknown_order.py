@@ -1,4 +1,4 @@
-"""An effect's strength is of unknown order of magnitude: small ones do not pay for being small, nor units for theirs."""
+"""An effect's strength is of unknown order of magnitude: nothing is paid for being small, or for the unit."""
 
 from itertools import product
 
@@ -19,7 +19,8 @@ def posterior(told, likelihood):
 
 
 @pytest.mark.parametrize(
-    ("sd", "told", "lowest"), [(0.01, 0.05, NONE), (0.1, 0.3, NONE), (1e-3, 0.004, 0.0), (0.1, -0.1, 0.0), (0.1, 0.1, -0.2)]
+    ("sd", "told", "lowest"),
+    [(0.01, 0.05, NONE), (0.1, 0.3, NONE), (1e-3, 0.004, 0.0), (0.1, -0.1, 0.0), (0.1, 0.1, -0.2)],
 )  # fmt: skip
 def test_one_amplitude_is_integrated_as_quadrature_does(sd, told, lowest):
     """The gain of the mixture is the ratio of two integrals over the amplitude, each by SciPy's quadrature."""
