@@ -11,7 +11,8 @@ from scipy.stats import multivariate_normal, norm, t
 
 from symplearn.diagnosis._calibrate import calibrate, residuals, weights
 from symplearn.diagnosis._noisy import PathFit, fit_paths
-from symplearn.diagnosis._scan import Unit, on_path, scan
+from symplearn.diagnosis._scan import on_path, scan
+from symplearn.diagnosis._score import Unit
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
 from symplearn.diagnosis._weighed import weigh_white

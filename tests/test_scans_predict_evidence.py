@@ -5,10 +5,13 @@ from dataclasses import replace
 import engine_cases as cases
 import numpy as np
 import pytest
+from scipy.special import logsumexp
 
 from symplearn.diagnosis._calibrate import calibrate
-from symplearn.diagnosis._scan import Unit, grid, on_trajectory, scan
+from symplearn.diagnosis._scan import grid, on_trajectory, scan
+from symplearn.diagnosis._score import Unit
 from symplearn.diagnosis._start import priors_without_effects
+from symplearn.diagnosis._strength import WIDTHS
 from symplearn.diagnosis._trajectory import Stepper
 
 MASS, STIFFNESS, NOISE = 2.0, 3.0, 0.05
@@ -97,9 +100,9 @@ def columns(times, effect, place):
     return [response(times, lambda t, f=f: f(place * t)) for f in (np.cos, np.sin)]
 
 
-def log_evidence(problem, further=None, recordings=()):
-    """Of linear least squares with Gaussian priors; `further` are columns by recording."""
-    design, y, sd = [], [], [*X0_SD, *X0_SD, PULL_SD, *[SCALE] * (len(further[0]) if further else 0)]
+def least_squares(problem, further=None, recordings=(), scale=SCALE):
+    """Log evidence and precision of linear least squares with Gaussian priors; `further` are columns by recording."""
+    design, y, sd = [], [], [*X0_SD, *X0_SD, PULL_SD, *[scale] * (len(further[0]) if further else 0)]
     for r, run in enumerate(problem.rows):
         block = np.zeros((len(run.times), len(sd)))
         for k, start in enumerate(np.eye(2)):
@@ -113,12 +116,17 @@ def log_evidence(problem, further=None, recordings=()):
     A, b = np.vstack([J, np.diag(1 / np.array(sd))]), np.concatenate([y, np.zeros(len(sd))])
     z, *_ = np.linalg.lstsq(A, b, rcond=None)
     determinant = np.linalg.slogdet(A.T @ A)[1]
-    return -0.5 * ((b - A @ z) ** 2).sum() - 0.5 * determinant - np.log(sd).sum()
+    return -0.5 * ((b - A @ z) ** 2).sum() - 0.5 * determinant - np.log(sd).sum(), A.T @ A
 
 
 def refit_gain(problem, effect, place, recordings):
+    """With amplitudes of every order of magnitude, from four standard errors to the largest, equally likely."""
     by_run = [columns(run.times, effect, place) for run in problem.rows]
-    return log_evidence(problem, by_run, recordings) - log_evidence(problem)
+    covariance = np.linalg.inv(least_squares(problem, by_run, recordings)[1])[5:, 5:]
+    information = np.trace(np.linalg.inv(covariance) - np.eye(len(covariance)) / SCALE**2) / len(covariance)
+    scales = np.geomspace(min(4 / np.sqrt(information), SCALE), SCALE, WIDTHS)
+    each = [least_squares(problem, by_run, recordings, scale)[0] for scale in scales]
+    return logsumexp(each) - np.log(len(each)) - least_squares(problem)[0]
 
 
 LINEAR = [effect for effect in SEARCHED if effect != "viscous_damping"]

@@ -111,7 +111,7 @@ def orthants(
         covariance = covariance - with_i[..., :, None] * with_i[..., None, :] * less
         held = np.maximum(covariance[..., diagonal, diagonal], 1e-12)
         covariance[..., diagonal, diagonal] = held
-    return total
+    return np.asarray(total)
 
 
 def variance_inflation(scores: Float[np.ndarray, "time z"], blocks: tuple[int, ...] = (12, 24, 48)) -> float:

@@ -6,46 +6,23 @@ amplitude zero, so it is tried on a grid; the best places are where fits begin.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import zip_longest
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from .. import _effects as effects
 from .._effects import Candidate, Oscillating
 from ._calibrate import Fits, Priors, residuals, weights
 from ._noisy import PathFit, lane_grams
 from ._problem import SLOTS, Combination, Problem
-from ._strength import mixture_gain
+from ._score import Nuisance, Start, Unit, nuisance, placed, score
 from ._trajectory import DIRECTIONS, LANES, Stepper
 
 # Places tried for times and thresholds, and the most frequencies; frequencies this many times pi over the span apart.
 _TIMES, _THRESHOLDS, _FREQUENCIES, _SPACING = 60, 12, 160, 0.8
 # Starts kept for each effect and target, and for each choice of recordings.
 _BEST = 3
-
-
-@dataclass(frozen=True)
-class Unit:
-    """An effect on a target at one place."""
-
-    candidate: int
-    place: float | None
-
-
-@dataclass(frozen=True, eq=False)
-class Start:
-    """Where a fit of a combination begins, and the log evidence that it is expected to gain.
-
-    `still` is the fit that a score was taken at, where the new effect has no amplitude yet.
-    """
-
-    combination: Combination
-    z: Float[np.ndarray, " z"]
-    gain: float
-    still: Float[np.ndarray, " z"] | None = None
 
 
 def grid(problem: Problem, priors: Priors, candidate: int) -> list[Unit]:
@@ -124,14 +101,14 @@ def on_trajectory(stepper: Stepper, fits: Fits, lane: int, rows: Sequence[int]) 
     problem, combination = stepper.problem, fits.combinations[lane]
     weight = weights(problem, rows)
     r = residuals(problem, fits.predictions, weight)
-    nuisance = problem.state + problem.calibrated.size
+    unknown = problem.state + problem.calibrated.size
 
     def of(lanes: Sequence[Sequence[Unit]]) -> list[list[list[np.ndarray]]]:
         laid = [layout(problem, units) for units in lanes]
         found: list[list[list[np.ndarray]]] = [[[] for _ in units] for units in lanes]
         for k, w in enumerate(weight):
             root = np.where(w > 0, np.sqrt(w), 0.0) / fits.noise[lane]
-            known = fits.predictions[k].slopes[lane, :nuisance]
+            known = fits.predictions[k].slopes[lane, :unknown]
             slopes = stepper.responses(fits.z[lane], combination, laid, rows[k], k)
             for b, (units, (_, _, amplitudes)) in enumerate(zip(lanes, laid, strict=True)):
                 for u, unit in enumerate(units):
@@ -139,7 +116,7 @@ def on_trajectory(stepper: Stepper, fits: Fits, lane: int, rows: Sequence[int]) 
                     if problem.equations.candidates[unit.candidate].effect is effects.HIDDEN:
                         own = known.copy()
                         own[_unseen(problem)] = slopes[b][_unseen(problem)]
-                    further = slopes[b][nuisance + amplitudes[u]]
+                    further = slopes[b][unknown + amplitudes[u]]
                     columns = np.concatenate([r[k][lane][None], own, further]) * root
                     flat = np.nan_to_num(columns.reshape(len(columns), -1))
                     found[b][u].append(flat @ flat.T)
@@ -151,7 +128,7 @@ def on_trajectory(stepper: Stepper, fits: Fits, lane: int, rows: Sequence[int]) 
 def on_path(stepper: Stepper, fit: PathFit, rows: Sequence[int]) -> Grams:
     """Grams about a path with a missing force: innovations, which follow the recording however far it has gone."""
     problem = stepper.problem
-    nuisance = 1 + problem.state + problem.calibrated.size
+    unknown = 1 + problem.state + problem.calibrated.size
 
     def of(lanes: Sequence[Sequence[Unit]]) -> list[list[list[np.ndarray]]]:
         laid = [layout(problem, units) for units in lanes]
@@ -160,7 +137,7 @@ def on_path(stepper: Stepper, fit: PathFit, rows: Sequence[int]) -> Grams:
             grams = lane_grams(stepper, fit, [(values, matrix) for values, matrix, _ in laid], rows, k)
             for b, (units, (_, _, amplitudes)) in enumerate(zip(lanes, laid, strict=True)):
                 for u in range(len(units)):
-                    some = np.concatenate([np.arange(nuisance), nuisance + amplitudes[u]])
+                    some = np.concatenate([np.arange(unknown), unknown + amplitudes[u]])
                     found[b][u].append(grams[b][np.ix_(some, some)])
         return found
 
@@ -179,14 +156,14 @@ def scan(
     """Starts of `combination` with one further effect each, the best places of every effect and target."""
     lanes = list(packed(problem, units))
     found: dict[int, list[tuple[float, Start]]] = {}
-    nuisances: dict[int, _Nuisance] = {}
+    nuisances: dict[int, Nuisance] = {}
     for a in range(0, len(lanes), LANES):
         some = lanes[a : a + LANES]
         for group, by_unit in zip(some, grams(some), strict=True):
             for unit, by_recording in zip(group, by_unit, strict=True):
                 for member in _members(problem, unit, combination):
-                    others = _nuisance(problem, by_recording, z, combination, priors, member, nuisances)
-                    start = _scored(problem, by_recording, z, combination, priors, unit, member, others)
+                    others = nuisance(problem, by_recording, z, combination, priors, member, nuisances)
+                    start = score(problem, by_recording, z, combination, priors, unit, member, others)
                     if start is not None:
                         found.setdefault(member, []).append((0.0 if unit.place is None else unit.place, start))
     return [start for listed in found.values() for start in _peaks(listed)]
@@ -206,7 +183,7 @@ def noise_starts(problem: Problem, fits: Fits, rows: Sequence[int]) -> list[Star
             factor = max(float(square[one.place] / number[one.place]), 1e-300)
             gain = 0.5 * float(number[one.place]) * (factor - 1.0 - np.log(factor))
             larger, unit = tuple(sorted((*combination, member))), Unit(member, None)
-            begin = _placed(problem, z, bare.copy(), combination, larger, member, np.zeros(one.effect.size), unit)
+            begin = placed(problem, z, bare.copy(), combination, larger, member, np.zeros(one.effect.size), unit)
             found.append(Start(larger, begin, gain))
     return found
 
@@ -218,102 +195,6 @@ def _members(problem: Problem, unit: Unit, combination: Combination) -> list[int
     if single and len(problem.rows) > 1:
         members = [m for m in members if len(problem.members[m].recordings) == 1]
     return [m for m in members if problem.is_possible((*combination, m))]
-
-
-class _Nuisance(NamedTuple):
-    """Everything but an effect's amplitudes, at its best without them."""
-
-    active: Bool[np.ndarray, " z"]
-    inverse: Float[np.ndarray, "active active"]
-    vector: Float[np.ndarray, " active"]
-
-
-def _nuisance(
-    problem: Problem, by_recording: Sequence[np.ndarray], z, combination: Combination, priors: Priors, member: int,
-    kept: dict[int, _Nuisance],
-) -> _Nuisance:  # fmt: skip
-    """The same for every effect, but for an unseen oscillator, whose start is unknown too."""
-    unseen = problem.candidate(member).effect is effects.HIDDEN
-    if not unseen and kept:
-        return kept[0]
-    n = problem.slots
-    active = problem.active((member,))[:n]
-    gram = np.zeros((1 + n, 1 + n))
-    for r, own in enumerate(by_recording):
-        place = np.concatenate([[0], 1 + _own(problem, r)])
-        gram[np.ix_(place, place)] += own[: len(place), : len(place)]
-    precision = priors.precision_of(problem, (member,))[:n]
-    vector = gram[0, 1:] - precision * (z - priors.mean_of(problem, combination))[:n]
-    inverse = _inverse(gram[1:, 1:][np.ix_(active, active)] + np.diag(precision[active]))
-    found = _Nuisance(active, inverse, vector[active])
-    if not unseen:
-        kept[0] = found
-    return found
-
-
-def _own(problem: Problem, recording: int) -> np.ndarray:
-    """Entries of z that one recording depends on beside the values of effects."""
-    return problem.local(recording)[: problem.state + problem.calibrated.size]
-
-
-def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """The inverse; NaN where there is none. A direction that nothing holds keeps a wide, finite spread."""
-    if not np.isfinite(matrix).all():
-        return np.full_like(matrix, np.nan)
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    return (vectors / np.maximum(values, 1e-13)) @ vectors.T / np.outer(scale, scale)
-
-
-def _scored(
-    problem: Problem, by_recording: Sequence[np.ndarray], z, combination: Combination, priors: Priors, unit: Unit,
-    member: int, others: _Nuisance,
-) -> Start | None:  # fmt: skip
-    """The step that a unit's amplitudes and everything else would take, and what it gains."""
-    one, n = problem.candidate(member), problem.slots
-    number = one.effect.amplitudes
-    cross, square, vector = np.zeros((n, number)), np.zeros((number, number)), np.zeros(number)
-    for r in problem.members[member].recordings:
-        own, gram = _own(problem, r), by_recording[r]
-        k = 1 + len(own)
-        cross[own] += gram[1:k, k:]
-        square, vector = square + gram[k:, k:], vector + gram[0, k:]
-    cross = cross[others.active]
-    scales = priors.scales[one.first : one.first + number]
-    after = others.inverse @ cross  # how the others follow a unit of each amplitude
-    # What the others can take over wholly leaves a difference of round-off, not less than nothing.
-    left = square - cross.T @ after + np.diag(scales**-2.0 + 1e-12 * np.diag(square))
-    spread = _inverse(left)
-    push = vector - after.T @ others.vector
-    amplitudes = spread @ push
-    if not np.isfinite(amplitudes).all() or (one.effect.positive and amplitudes[0] < 0):
-        return None
-    lowest = np.full(number, 0.0 if one.effect.positive else -np.inf)
-    if one.effect.positive:
-        amplitudes = np.maximum(amplitudes, 0.0)
-    gain = 0.5 * push @ amplitudes + 0.5 * np.linalg.slogdet(spread)[1] - np.log(scales).sum()
-    gain += mixture_gain(amplitudes / scales, spread / np.outer(scales, scales), np.zeros(number, int), lowest / scales)
-    larger = tuple(sorted((*combination, member)))
-    begin = z.copy()
-    begin[:n][others.active] += others.inverse @ others.vector - after @ amplitudes
-    begin[n:] = 0.0
-    bare = np.where(np.arange(len(z)) < n, z, 0.0)
-    ends = [
-        _placed(problem, z, at, combination, larger, member, size, unit)
-        for at, size in ((begin, amplitudes), (bare, np.zeros(number)))
-    ]
-    return Start(larger, ends[0], float(gain), ends[1])
-
-
-def _placed(problem, z, begin, combination, larger, member, amplitudes, unit: Unit) -> np.ndarray:
-    """Values of the old effects where they are, and of the new one where the step puts them."""
-    old = dict(problem.placed(combination))
-    for m, place in problem.placed(larger):
-        if m == member:
-            begin[place] = np.append(amplitudes, [] if unit.place is None else [unit.place])
-        else:
-            begin[place] = z[old[m]]
-    return begin
 
 
 def _peaks(listed: list[tuple[float, Start]]) -> list[Start]:

@@ -13,7 +13,8 @@ from ._found import Found
 from ._noisy import PathFit, fit_paths
 from ._null_paths import beside, null_paths
 from ._problem import MOST, Combination, Problem
-from ._scan import Start, Unit, grid, noise_starts, on_path, on_trajectory, scan, spacing
+from ._scan import grid, noise_starts, on_path, on_trajectory, scan, spacing
+from ._score import Start, Unit
 from ._start import priors_without_effects, with_states
 from ._stochastic import free_run
 from ._trajectory import LANES, Stepper
@@ -32,8 +33,8 @@ _FORCED = 6
 _BATCH = 24
 # Combinations whose places are moved, how near they are to the best; and those that are weighed again in finer steps.
 _MOVED, _NEAR, _AGAIN = 3, 8.0, 24
-# Places at which an effect is tried beside nothing, and beside others; fewer where a trajectory costs more than one
-# of so many leapfrog substeps, and how much more a substep of a nonseparable system costs.
+# Places at which an effect is tried beside the best of the size below, and beside others; fewer where a trajectory
+# costs more than one of so many leapfrog substeps; how much more a substep of a nonseparable system costs.
 _MANY, _FEW, _LEAST = 160, 60, 10
 _CHEAP, _NONSEPARABLE = 600, 5
 _ONE_MORE = {1: "one effect", 2: "a second effect", 3: "a third effect"}
@@ -229,10 +230,11 @@ class Search:
         best = sorted(best, key=self.found.best, reverse=True)
         top = self.found.best(best[0]) if best else -np.inf
         listed: list[Start] = []
-        for c in [c for c in best if self.found.best(c) > top - _REACH][:_BASES]:
+        for k, c in enumerate([c for c in best if self.found.best(c) > top - _REACH][:_BASES]):
             white = self.found.of(c, "white")
             assert white is not None  # every combination is weighed under white noise first
-            mine = self._scanned(c, white.z, _FEW)
+            # Thinned frequencies miss an oscillation that stays in tune throughout, so the best one has more of them.
+            mine = self._scanned(c, white.z, _FEW if k else _MANY)
             listed += [replace(start, gain=start.gain + self.found.best(c)) for start in mine]
         listed.sort(key=lambda start: -start.gain)
         kept: dict[tuple[Combination, int], Start] = {}

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from ._along import along_all, force
+from ._along import along, along_all, force, readings, velocity
 from ._calibrate import Fits, Priors, calibrate, grow, residuals, weights
 from ._effect_priors import rms
 from ._problem import Problem
@@ -17,6 +17,8 @@ _STARTS = 16
 _SPREADS = (1e-3, 0.1, 1.0, 10.0)
 # Where nothing is known: this many times the size of what was found.
 _WIDE = 10.0
+# Relative round-off of forces a whole turn on.
+_ROUND_OFF = 1e-9
 
 
 def priors_without_effects(problem: Problem) -> Priors:
@@ -65,7 +67,35 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
     fits = calibrate(stepper, z, [()] * _STARTS, tight, short[0], 40)
     fits = grow(stepper, _recombined(problem, fits, short[0]), fits.combinations, priors, short[1:])
     order = np.argsort(np.where(np.isfinite(fits.cost), _likelihood(problem, fits, short[-1]), np.inf))
-    return Fits([()] * _STARTS, fits.z[order], fits.noise[order], [], fits.cost[order], fits.converged[order])
+    z = np.stack([without_turns(problem, z) for z in fits.z[order]])
+    return Fits([()] * _STARTS, z, fits.noise[order], [], fits.cost[order], fits.converged[order])
+
+
+def without_turns(problem: Problem, z: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+    """The same motion with every angle of unknown start that nothing reads begun within half a turn of its prior mean.
+
+    A whole turn changes nothing there, but a spring that is looked for would start wound up.
+    """
+    z = z.copy()
+    for r in range(len(problem.rows)):
+        begin = slice(r * problem.state, (r + 1) * problem.state)
+        for i in range(problem.equations.dim):
+            x = z[begin]
+            if np.isinf(problem.initial.sd[i]) and np.isfinite(x).all() and _is_unread_angle(problem, r, z, x, i):
+                away = x[i] - problem.initial.mean[i]
+                z[begin.start + i] = problem.initial.mean[i] + np.remainder(away + np.pi, 2 * np.pi) - np.pi
+    return z
+
+
+def _is_unread_angle(problem: Problem, r: int, z: np.ndarray, x: np.ndarray, i: int) -> bool:
+    """Whether a whole turn of a coordinate changes neither what moves it nor what is read, at a point and off it."""
+    points = np.stack([x, x + 0.3, x - 0.7])
+    turned = points + 2 * np.pi * (np.arange(len(x)) == i)
+    for what in (force, velocity, readings):
+        here, there = (along(problem, what, r, z, (), some) for some in (points, turned))
+        if not np.allclose(here, there, rtol=_ROUND_OFF, atol=_ROUND_OFF * np.abs(here).max()):
+            return False
+    return True
 
 
 def _recombined(problem: Problem, fits: Fits, rows: Sequence[int]) -> Float[np.ndarray, "lane z"]:

@@ -11,8 +11,8 @@ from ._calibrate import Fits, Priors, grow, residuals, weights
 from ._found import Found
 from ._noisy import PathFit, fit_paths
 from ._problem import MOST, Combination, Problem
-from ._scan import Start
 from ._scatter import outlier_evidence, outliers, suspects
+from ._score import Start
 from ._start import windows
 from ._strength import strength_gain
 from ._trajectory import Stepper

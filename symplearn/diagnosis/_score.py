@@ -1,0 +1,168 @@
+"""What one effect more would gain at one place, and where its fit would begin: the score test of Rao (1948)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .. import _effects as effects
+from ._calibrate import Priors
+from ._problem import Combination, Problem
+from ._strength import mixture_gain
+
+
+@dataclass(frozen=True)
+class Unit:
+    """An effect on a target at one place."""
+
+    candidate: int
+    place: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a fit of a combination begins, and the log evidence that it is expected to gain.
+
+    `still` is the fit that a score was taken at, where the new effect has no amplitude yet.
+    """
+
+    combination: Combination
+    z: Float[np.ndarray, " z"]
+    gain: float
+    still: Float[np.ndarray, " z"] | None = None
+
+
+class Nuisance(NamedTuple):
+    """Everything but an effect's amplitudes, at its best without them."""
+
+    active: Bool[np.ndarray, " z"]
+    inverse: Float[np.ndarray, "active active"]
+    vector: Float[np.ndarray, " active"]
+    gain: float = 0.0  # of an unseen start, under the widest prior
+
+    @property
+    def earned(self) -> float:
+        """Log evidence of these unknowns, but for the density of their priors."""
+        return float(0.5 * self.vector @ self.inverse @ self.vector + 0.5 * np.linalg.slogdet(self.inverse)[1])
+
+
+def nuisance(
+    problem: Problem, by_recording: Sequence[np.ndarray], z, combination: Combination, priors: Priors, member: int,
+    kept: dict[int, Nuisance],
+) -> Nuisance:  # fmt: skip
+    """The same for every effect, but for an unseen oscillator, whose start is unknown too."""
+    if not kept:
+        kept[0] = _remaining(problem, by_recording, z, combination, priors, ())
+    if problem.candidate(member).effect is not effects.HIDDEN:
+        return kept[0]
+    found = _remaining(problem, by_recording, z, combination, priors, (member,))
+    width = priors.precision_of(problem, (member,))[_starts(problem, member)]
+    return found._replace(gain=found.earned - kept[0].earned + float(0.5 * np.log(width).sum()))
+
+
+def _starts(problem: Problem, member: int) -> np.ndarray:
+    """Where in z an unseen oscillator begins."""
+    return np.concatenate([problem.unseen(r) for r in problem.members[member].recordings])
+
+
+def _remaining(
+    problem: Problem, by_recording: Sequence[np.ndarray], z, combination: Combination, priors: Priors,
+    added: Combination,
+) -> Nuisance:  # fmt: skip
+    n = problem.slots
+    active = problem.active(added)[:n]
+    gram = np.zeros((1 + n, 1 + n))
+    for r, own in enumerate(by_recording):
+        place = np.concatenate([[0], 1 + _own(problem, r)])
+        gram[np.ix_(place, place)] += own[: len(place), : len(place)]
+    precision = priors.precision_of(problem, added)[:n]
+    vector = gram[0, 1:] - precision * (z - priors.mean_of(problem, combination))[:n]
+    inverse = _inverse(gram[1:, 1:][np.ix_(active, active)] + np.diag(precision[active]))
+    return Nuisance(active, inverse, vector[active])
+
+
+def _own(problem: Problem, recording: int) -> np.ndarray:
+    """Entries of z that one recording depends on beside the values of effects."""
+    return problem.local(recording)[: problem.state + problem.calibrated.size]
+
+
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    """The inverse; NaN where there is none. A direction that nothing holds keeps a wide, finite spread."""
+    if not np.isfinite(matrix).all():
+        return np.full_like(matrix, np.nan)
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    return (vectors / np.maximum(values, 1e-13)) @ vectors.T / np.outer(scale, scale)
+
+
+def score(
+    problem: Problem, by_recording: Sequence[np.ndarray], z, combination: Combination, priors: Priors, unit: Unit,
+    member: int, others: Nuisance,
+) -> Start | None:  # fmt: skip
+    """The step that a unit's amplitudes and everything else would take, and what it gains."""
+    one, n = problem.candidate(member), problem.slots
+    number = one.effect.amplitudes
+    cross, square, vector = np.zeros((n, number)), np.zeros((number, number)), np.zeros(number)
+    for r in problem.members[member].recordings:
+        own, gram = _own(problem, r), by_recording[r]
+        k = 1 + len(own)
+        cross[own] += gram[1:k, k:]
+        square, vector = square + gram[k:, k:], vector + gram[0, k:]
+    cross = cross[others.active]
+    scales = priors.scales[one.first : one.first + number]
+    after = others.inverse @ cross  # how the others follow a unit of each amplitude
+    # What the others can take over wholly leaves a difference of round-off, not less than nothing.
+    left = square - cross.T @ after + np.diag(scales**-2.0 + 1e-12 * np.diag(square))
+    spread = _inverse(left)
+    push = vector - after.T @ others.vector
+    amplitudes = spread @ push
+    if not np.isfinite(amplitudes).all() or (one.effect.positive and amplitudes[0] < 0):
+        return None
+    lowest = np.full(number, 0.0 if one.effect.positive else -np.inf)
+    if one.effect.positive:
+        amplitudes = np.maximum(amplitudes, 0.0)
+    gain = others.gain + 0.5 * push @ amplitudes + 0.5 * np.linalg.slogdet(spread)[1] - np.log(scales).sum()
+    if one.effect is effects.HIDDEN:
+        gain += _unseen_strength(problem, member, priors, others, after, amplitudes, spread)
+    else:
+        shape = np.outer(scales, scales)
+        gain += mixture_gain(amplitudes / scales, spread / shape, np.zeros(number, int), lowest / scales)
+    larger = tuple(sorted((*combination, member)))
+    begin = z.copy()
+    begin[:n][others.active] += others.inverse @ others.vector - after @ amplitudes
+    begin[n:] = 0.0
+    bare = np.where(np.arange(len(z)) < n, z, 0.0)
+    ends = [
+        placed(problem, z, at, combination, larger, member, size, unit)
+        for at, size in ((begin, amplitudes), (bare, np.zeros(number)))
+    ]
+    return Start(larger, ends[0], float(gain), ends[1])
+
+
+def _unseen_strength(problem, member: int, priors: Priors, others: Nuisance, after, amplitudes, spread) -> float:
+    """What an unseen oscillator gains for being of any strength: its amplitude and its start together."""
+    some = np.isin(np.nonzero(others.active)[0], _starts(problem, member))
+    scales = np.append(
+        priors.scales[problem.candidate(member).first],
+        priors.precision_of(problem, (member,))[_starts(problem, member)] ** -0.5,
+    )
+    begin = others.inverse @ others.vector - after @ amplitudes
+    cross = -after[some] @ spread
+    corner = others.inverse[np.ix_(some, some)] + after[some] @ spread @ after[some].T
+    joint = np.block([[spread, cross.T], [cross, corner]])
+    centre, lowest = np.append(amplitudes, begin[some]), np.append(0.0, np.full(some.sum(), -np.inf))
+    shape = np.outer(scales, scales)
+    return mixture_gain(centre / scales, joint / shape, np.zeros(len(centre), int), lowest)
+
+
+def placed(problem, z, begin, combination, larger, member, amplitudes, unit: Unit) -> np.ndarray:
+    """Values of the old effects where they are, and of the new one where the step puts them."""
+    old = dict(problem.placed(combination))
+    for m, place in problem.placed(larger):
+        if m == member:
+            begin[place] = np.append(amplitudes, [] if unit.place is None else [unit.place])
+        else:
+            begin[place] = z[old[m]]
+    return begin
