@@ -20,6 +20,7 @@ from ._effects import (
     GYROSCOPIC,
     HIDDEN,
     MODULATION,
+    ON_PARAMETERS,
     QUADRATIC,
     REGIME,
     RELATIVE,
@@ -39,6 +40,8 @@ def taken_apart(equations: Equations, coefficients: Float[Array, " coefficient"]
         firsts = equations.firsts(one.effect, one.side)
         entries = range(one.effect.size + one.effect.switched)
         found[one.effect.name, one.side] = tuple(coefficients[firsts + k] for k in entries)
+    for effect in ON_PARAMETERS:  # of which a simulation may have none
+        found.setdefault((effect.name, None), (coefficients[:0],) * effect.size)
     return found
 
 

@@ -33,7 +33,9 @@ from augmented_cases import (
 )  # fmt: skip
 from engine_cases import solved
 
+from symplearn._augmented import equations
 from symplearn._augmented_flow import SimulatedFlow, Span
+from symplearn._terms import Mechanics
 
 DRIVEN = compiled(P**2 / (2 * M) + K * Q**2 / 2, K * U - sympy.Rational(1, 10) * P * sympy.cos(T), (U,))
 SHAKEN = compiled(P**2 / (2 * M) + K * Q**2 * (1 + sympy.sin(3 * T) / 2) / 2, sympy.cos(T))
@@ -41,6 +43,16 @@ SHAPES = pytest.mark.parametrize(
     ("built", "method", "rates"), [(SOFT, LEAPFROG, soft), (CURVED, TAO, curved)], ids=["separable", "nonseparable"]
 )
 JUMP, CHANGE = {"j": 0.5, "t_star": 1.2345}, {"d": 0.6, "t_star": 1.2345}
+
+
+def test_a_simulation_may_have_no_parameters():
+    """Numbers written into the Hamiltonian leave nothing that may vary, and the motion is SciPy's."""
+    built = equations(Mechanics([Q], [P], P**2 / 2 + sympy.cosh(Q), [sympy.Integer(0)], {"y": Q}, start=0.0), (), ())
+    step = SimulatedFlow(built, LEAPFROG, jnp.zeros(0), jnp.zeros(built.size))
+    span = Span(jnp.asarray(0.0), jnp.asarray(0.005), jnp.zeros((1, 0)), jnp.asarray(400))
+    expected = solved(lambda t, x: [x[1], -np.sinh(x[0])], START, np.array([0.0, 2.0]))[-1]
+    # Order two: 0.005^2 / 12 by some units of time and slope.
+    np.testing.assert_allclose(step(jnp.asarray(widened(START)), span)[::2], expected, atol=2e-5)
 
 
 def test_known_forces_with_inputs_and_momenta_are_added():

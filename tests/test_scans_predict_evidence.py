@@ -102,7 +102,7 @@ def columns(times, effect, place):
 
 def least_squares(problem, further=None, recordings=(), scale=SCALE):
     """Log evidence and precision of linear least squares with Gaussian priors; `further` are columns by recording."""
-    design, y, sd = [], [], [*X0_SD, *X0_SD, PULL_SD, *[scale] * (len(further[0]) if further else 0)]
+    design, y, sd = [], [], [*X0_SD, *X0_SD, PULL_SD, *np.resize(scale, len(further[0]) if further else 0)]
     for r, run in enumerate(problem.rows):
         block = np.zeros((len(run.times), len(sd)))
         for k, start in enumerate(np.eye(2)):
@@ -122,10 +122,15 @@ def least_squares(problem, further=None, recordings=(), scale=SCALE):
 def refit_gain(problem, effect, place, recordings):
     """With amplitudes of every order of magnitude, from four standard errors to the largest, equally likely."""
     by_run = [columns(run.times, effect, place) for run in problem.rows]
-    covariance = np.linalg.inv(least_squares(problem, by_run, recordings)[1])[5:, 5:]
-    information = np.trace(np.linalg.inv(covariance) - np.eye(len(covariance)) / SCALE**2) / len(covariance)
-    scales = np.geomspace(min(4 / np.sqrt(information), SCALE), SCALE, WIDTHS)
-    each = [least_squares(problem, by_run, recordings, scale)[0] for scale in scales]
+    return mixture(problem, by_run, recordings, np.full(len(by_run[0]), SCALE))
+
+
+def mixture(problem, by_run, recordings, largest):
+    """Log evidence that the columns earn; `largest` are the widest priors of their factors."""
+    covariance = np.linalg.inv(least_squares(problem, by_run, recordings, largest)[1])[5:, 5:]
+    told = (np.linalg.inv(covariance) - np.diag(largest**-2.0)) * np.outer(largest, largest)
+    shares = np.geomspace(min(4 / np.sqrt(np.trace(told) / len(told)), 1.0), 1.0, WIDTHS)
+    each = [least_squares(problem, by_run, recordings, share * largest)[0] for share in shares]
     return logsumexp(each) - np.log(len(each)) - least_squares(problem)[0]
 
 
@@ -192,3 +197,44 @@ def test_a_drag_that_would_push_is_no_start(stepper, starts):
         (member,) = s.combination
         if p.candidate(member).effect.positive:
             assert s.z[p.placed(s.combination)[0][1].start] >= 0
+
+
+UNSEEN = np.array([0.4, 0.6])  # prior sd of an unseen oscillator's start
+
+
+def driven(times, start, pull, omega):
+    """Position of a second, equal oscillator that an unseen one pushes, which the first one moves from rest."""
+
+    def rates(t, x):
+        return [
+            x[1] / MASS,
+            pull - STIFFNESS * x[0],
+            x[3],
+            x[0] - omega**2 * x[2],
+            x[5] / MASS,
+            x[2] - STIFFNESS * x[4],
+        ]
+
+    return cases.solved(rates, [*start, 0.0, 0.0, 0.0, 0.0], times)[:, 4]
+
+
+def test_an_unseen_oscillator_that_moves_already_is_seen(stepper, priors, fits):
+    """What an unseen oscillator pulls with from the first row on counts in its gain, beside what it is driven to:
+    NumPy's least squares with its start in either recording and its strength, all of one order of magnitude."""
+    p, omega = stepper.problem, FORCING[1]
+    member = next(m for m in p.searched if p.candidate(m).effect.name == "hidden_oscillator")
+    grams = on_trajectory(stepper, fits, 0, ROWS)
+    (start,) = scan(p, grams, fits.z[0], (), replace(priors, unseen=UNSEEN), [Unit(member, omega)])[:1]
+    by_run = []
+    for r, run in enumerate(p.rows):
+        x0, pull = fits.z[0][p.state * r + np.array([0, p.state // 2])], fits.z[0][p.head]
+        pushed = [
+            response(run.times, lambda t: np.cos(omega * t)),
+            response(run.times, lambda t: np.sin(omega * t) / omega),
+        ]
+        still = [0 * run.times] * 2
+        by_run.append([driven(run.times, x0, pull, omega), *(still * r), *pushed, *(still * (1 - r))])
+    expected = mixture(p, by_run, (0, 1), np.array([SCALE, *UNSEEN, *UNSEEN]))
+    assert p.members[start.combination[0]].recordings == (0, 1)
+    # The substep's error.
+    assert start.gain == pytest.approx(expected, abs=2e-3 * abs(expected)) and expected > 50

@@ -82,8 +82,7 @@ def without_turns(problem: Problem, z: Float[np.ndarray, " z"]) -> Float[np.ndar
         for i in range(problem.equations.dim):
             x = z[begin]
             if np.isinf(problem.initial.sd[i]) and np.isfinite(x).all() and _is_unread_angle(problem, r, z, x, i):
-                away = x[i] - problem.initial.mean[i]
-                z[begin.start + i] = problem.initial.mean[i] + np.remainder(away + np.pi, 2 * np.pi) - np.pi
+                z[begin.start + i] -= 2 * np.pi * np.round((x[i] - problem.initial.mean[i]) / (2 * np.pi))
     return z
 
 
