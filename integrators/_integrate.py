@@ -84,11 +84,11 @@ def integrate(
 def propagate(
     system: System,
     integrator: AbstractIntegrator,
-    x: Float[Array, " two_d"],
+    x: Float[Array, "two_d ..."],
     t0: Time,
     t1: Time,
     substeps: int = 1,
-) -> Float[Array, " two_d"]:
+) -> Float[Array, "two_d ..."]:
     """The phase point at `t1` of the trajectory through `x` at `t0`: lift, `substeps` steps, project.
 
     The propagator of a filter, not jitted. It lifts at each call, so over many calls a method of two copies,
@@ -100,18 +100,13 @@ def propagate(
 def advance(
     system: System,
     integrator: AbstractIntegrator,
-    state: Float[Array, " n"],
+    state: Float[Array, "n ..."],
     t0: Time,
     t1: Time,
     substeps: int = 1,
-) -> Float[Array, " n"]:
+) -> Float[Array, "n ..."]:
     """The integrator's own state after `substeps` equal steps from `t0` to `t1`. Not jitted."""
-    dt, system = (t1 - t0) / substeps, system.prepared()
-
-    def one(state: Float[Array, " n"], count: Array) -> tuple[Float[Array, " n"], None]:
-        return integrator.step(system, state, t0 + count * dt, dt), None
-
-    return jax.lax.scan(one, state, jnp.arange(substeps))[0]
+    return integrator.march(system.prepared(), state, t0, (t1 - t0) / substeps, substeps)
 
 
 def strongly_typed(tree: Any) -> Any:

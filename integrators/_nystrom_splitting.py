@@ -43,10 +43,10 @@ class BlanesMoan4(AbstractIntegrator):
     def flow(
         self,
         hamiltonian: AbstractHamiltonian,
-        state: Float[Array, " n"],
+        state: Float[Array, "n ..."],
         t: Time,
         dt: Time,
-    ) -> Float[Array, " n"]:
+    ) -> Float[Array, "n ..."]:
         kicks = np.array([*_KICKS, 1.0 - 2.0 * sum(_KICKS), *_KICKS[::-1]])
         drifts = np.array([*_DRIFTS, 0.5 - sum(_DRIFTS)])
         drifts = np.concatenate([drifts, drifts[::-1]])

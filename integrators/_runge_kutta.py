@@ -46,10 +46,10 @@ class RK2(AbstractIntegrator):
     def flow(
         self,
         hamiltonian: AbstractHamiltonian,
-        state: Float[Array, " n"],
+        state: Float[Array, "n ..."],
         t: Time,
         dt: Time,
-    ) -> Float[Array, " n"]:
+    ) -> Float[Array, "n ..."]:
         k1 = hamiltonian.at(t).vector_field(state)
         k2 = hamiltonian.at(t + self.node * dt).vector_field(state + self.node * dt * k1)
         share = 0.5 / self.node
@@ -74,10 +74,10 @@ class RK4(AbstractIntegrator):
     def flow(
         self,
         hamiltonian: AbstractHamiltonian,
-        state: Float[Array, " n"],
+        state: Float[Array, "n ..."],
         t: Time,
         dt: Time,
-    ) -> Float[Array, " n"]:
+    ) -> Float[Array, "n ..."]:
         middle = hamiltonian.at(t + 0.5 * dt)
         k1 = hamiltonian.at(t).vector_field(state)
         k2 = middle.vector_field(state + 0.5 * dt * k1)
@@ -113,24 +113,24 @@ class ImplicitMidpoint(AbstractIntegrator):
     def flow(
         self,
         hamiltonian: AbstractHamiltonian,
-        state: Float[Array, " n"],
+        state: Float[Array, "n ..."],
         t: Time,
         dt: Time,
-    ) -> Float[Array, " n"]:
+    ) -> Float[Array, "n ..."]:
         field = hamiltonian.at(t + 0.5 * dt).vector_field
 
-        def residual(middle: Float[Array, " n"]) -> Float[Array, " n"]:
+        def residual(middle: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
             return middle - state - 0.5 * dt * field(middle)
 
         guess = state + 0.5 * dt * field(state)
         middle = jax.lax.custom_root(residual, guess, self._newton, _solve_dense)
         return 2.0 * middle - state
 
-    def _newton(self, residual, guess: Float[Array, " n"]) -> Float[Array, " n"]:
+    def _newton(self, residual, guess: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
         # A few ulps of the phase point: Newton's last correction then is round-off.
         tolerance = 64.0 * jnp.finfo(guess.dtype).eps
 
-        def settled(x: Float[Array, " n"], correction: Float[Array, " n"]) -> Bool[Array, ""]:
+        def settled(x: Float[Array, "n ..."], correction: Float[Array, "n ..."]) -> Bool[Array, ""]:
             return jnp.max(jnp.abs(correction)) <= tolerance * (1.0 + jnp.max(jnp.abs(x)))
 
         def unfinished(carry):
@@ -146,5 +146,5 @@ class ImplicitMidpoint(AbstractIntegrator):
         return jnp.where(settled(x, correction), x, jnp.nan)
 
 
-def _solve_dense(linear, right: Float[Array, " n"]) -> Float[Array, " n"]:
+def _solve_dense(linear, right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     return jnp.linalg.solve(jax.jacfwd(linear)(right), right)

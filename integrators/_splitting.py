@@ -6,10 +6,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from integrators._integrator import AbstractIntegrator
-from integrators._system import AbstractHamiltonian, Time, as_parameter, split
+from integrators._system import AbstractHamiltonian, System, Time, as_parameter, conservative, split
 
 
 class AbstractVerlet(AbstractIntegrator):
@@ -41,15 +42,33 @@ class Leapfrog(AbstractVerlet):
     def flow(
         self,
         hamiltonian: AbstractHamiltonian,
-        state: Float[Array, " n"],
+        state: Float[Array, "n ..."],
         t: Time,
         dt: Time,
-    ) -> Float[Array, " n"]:
+    ) -> Float[Array, "n ..."]:
         q, p = split(state)
         p = p - 0.5 * dt * hamiltonian.at(t + 0.25 * dt).slope(q, p)
         q = q + dt * hamiltonian.at(t + 0.5 * dt).velocity(q, p)
         p = p - 0.5 * dt * hamiltonian.at(t + 0.75 * dt).slope(q, p)
         return jnp.concatenate([q, p])
+
+    def march(
+        self, system: System, state: Float[Array, "n ..."], t: Time, dt: Time, steps: int
+    ) -> Float[Array, "n ..."]:
+        hamiltonian = conservative(system)
+        if hamiltonian is None or not hamiltonian.stands_still:
+            return super().march(system, state, t, dt, steps)
+        q, p = split(state)
+        begun = q, p - 0.5 * dt * hamiltonian.slope(q, p)
+
+        # The half kick that ends a step and the one that begins the next are one.
+        def one(state: tuple[Array, Array], kick: Any) -> tuple[tuple[Array, Array], None]:
+            q, p = state
+            q = q + dt * hamiltonian.velocity(q, p)
+            return (q, p - kick * dt * hamiltonian.slope(q, p)), None
+
+        kicks = np.where(np.arange(steps) < steps - 1, 1.0, 0.5)
+        return jnp.concatenate(jax.lax.scan(one, begun, kicks)[0])
 
 
 class PositionVerlet(AbstractVerlet):
@@ -61,10 +80,10 @@ class PositionVerlet(AbstractVerlet):
     def flow(
         self,
         hamiltonian: AbstractHamiltonian,
-        state: Float[Array, " n"],
+        state: Float[Array, "n ..."],
         t: Time,
         dt: Time,
-    ) -> Float[Array, " n"]:
+    ) -> Float[Array, "n ..."]:
         q, p = split(state)
         q = q + 0.5 * dt * hamiltonian.at(t + 0.25 * dt).velocity(q, p)
         p = p - dt * hamiltonian.at(t + 0.5 * dt).slope(q, p)
@@ -76,21 +95,21 @@ class AbstractProjection(eqx.Module):
     """How two copies of a phase point become one."""
 
     @abc.abstractmethod
-    def __call__(self, copies: Float[Array, "2 two_d"]) -> Float[Array, " two_d"]:
+    def __call__(self, copies: Float[Array, "2 two_d ..."]) -> Float[Array, "two_d ..."]:
         """The phase point of the two copies."""
 
 
 class FirstCopy(AbstractProjection):
     """Drops the second copy, as dissertation (5.18) does."""
 
-    def __call__(self, copies: Float[Array, "2 two_d"]) -> Float[Array, " two_d"]:
+    def __call__(self, copies: Float[Array, "2 two_d ..."]) -> Float[Array, "two_d ..."]:
         return copies[0]
 
 
 class MeanOfCopies(AbstractProjection):
     """The mean of both copies: far nearer to symplectic than dropping one (specification E40)."""
 
-    def __call__(self, copies: Float[Array, "2 two_d"]) -> Float[Array, " two_d"]:
+    def __call__(self, copies: Float[Array, "2 two_d ..."]) -> Float[Array, "two_d ..."]:
         return copies.mean(axis=0)
 
 
@@ -133,16 +152,16 @@ class Tao(AbstractIntegrator):
     def copies(self) -> int:
         return 2
 
-    def project(self, state: Float[Array, " n"]) -> Float[Array, " two_d"]:
-        return self.projection(state.reshape(2, -1))
+    def project(self, state: Float[Array, "n ..."]) -> Float[Array, "two_d ..."]:
+        return self.projection(state.reshape(2, -1, *state.shape[1:]))
 
     def flow(
         self,
         hamiltonian: AbstractHamiltonian,
-        state: Float[Array, " n"],
+        state: Float[Array, "n ..."],
         t: Time,
         dt: Time,
-    ) -> Float[Array, " n"]:
+    ) -> Float[Array, "n ..."]:
         q, p, x, y = jnp.split(state, 4)
         early, late = hamiltonian.at(t + 0.25 * dt), hamiltonian.at(t + 0.75 * dt)
         # H(q, y) moves p and x; H(x, p) moves q and y; the binding turns the differences of the copies.
@@ -164,19 +183,19 @@ class Tao(AbstractIntegrator):
 
 
 def _push(
-    hamiltonian: AbstractHamiltonian, q: Float[Array, " d"], p: Float[Array, " d"], dt: Time
-) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
+    hamiltonian: AbstractHamiltonian, q: Float[Array, "d ..."], p: Float[Array, "d ..."], dt: Time
+) -> tuple[Float[Array, "d ..."], Float[Array, "d ..."]]:
     """The way that half a step of H(q, p), both frozen, carries the other copy's coordinates and momenta."""
     return split(0.5 * dt * hamiltonian.vector_field(jnp.concatenate([q, p])))
 
 
 def _bind(
-    q: Float[Array, " d"],
-    p: Float[Array, " d"],
-    x: Float[Array, " d"],
-    y: Float[Array, " d"],
+    q: Float[Array, "d ..."],
+    p: Float[Array, "d ..."],
+    x: Float[Array, "d ..."],
+    y: Float[Array, "d ..."],
     angle: Float[Array, ""],
-) -> tuple[Float[Array, " d"], Float[Array, " d"], Float[Array, " d"], Float[Array, " d"]]:
+) -> tuple[Float[Array, "d ..."], Float[Array, "d ..."], Float[Array, "d ..."], Float[Array, "d ..."]]:
     """Exact flow of the binding: the copies' mean stays, their difference turns. Specification E39."""
     c, s = jnp.cos(angle), jnp.sin(angle)
     dq, dp = q - x, p - y
@@ -239,19 +258,19 @@ class Composition(AbstractIntegrator):
     def copies(self) -> int:
         return self.base.copies
 
-    def lift(self, x: Float[Array, " two_d"]) -> Float[Array, " n"]:
+    def lift(self, x: Float[Array, "two_d ..."]) -> Float[Array, "n ..."]:
         return self.base.lift(x)
 
-    def project(self, state: Float[Array, " n"]) -> Float[Array, " two_d"]:
+    def project(self, state: Float[Array, "n ..."]) -> Float[Array, "two_d ..."]:
         return self.base.project(state)
 
     def flow(
         self,
         hamiltonian: AbstractHamiltonian,
-        state: Float[Array, " n"],
+        state: Float[Array, "n ..."],
         t: Time,
         dt: Time,
-    ) -> Float[Array, " n"]:
+    ) -> Float[Array, "n ..."]:
         weights = jnp.asarray(self.weights, dtype=state.dtype)
         starts = jnp.cumsum(weights) - weights
 

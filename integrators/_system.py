@@ -22,8 +22,8 @@ def as_parameter(value: Any) -> Any:
     return value if isinstance(value, eqx.Module) else jnp.asarray(value, dtype=float)
 
 
-def split(x: Float[Array, " two_d"]) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
-    """The coordinates q and momenta p of a phase point x = [q, p]."""
+def split(x: Float[Array, "two_d ..."]) -> tuple[Float[Array, "d ..."], Float[Array, "d ..."]]:
+    """The coordinates q and momenta p of a phase point x = [q, p], or of many in columns."""
     d = x.shape[0] // 2
     return x[:d], x[d:]
 
@@ -34,6 +34,10 @@ class AbstractHamiltonian(eqx.Module):
     Subclass with `energy`. The derivatives come by automatic differentiation; override `velocity` and `slope`
     where analytic ones are cheaper. Parameters are array fields, see `as_parameter`.
     """
+
+    # Whether `velocity`, `slope` and `vector_field` also take many points at once, side by side in columns (d, point):
+    # faster than `vmap`, which puts the points first and leaves rows too short for a vector register.
+    side_by_side: ClassVar[bool] = False
 
     @abc.abstractmethod
     def energy(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, ""]:
@@ -55,6 +59,11 @@ class AbstractHamiltonian(eqx.Module):
     def at(self, t: Time) -> "AbstractHamiltonian":
         """The system as it stands at time `t`. A time-dependent one returns a copy with its time replaced."""
         return self
+
+    @property
+    def stands_still(self) -> bool:
+        """Whether the system is the same at all times."""
+        return type(self).at is AbstractHamiltonian.at
 
     def prepared(self) -> "AbstractHamiltonian":
         """The same system with all worked out that its parameters alone determine; asked for once, before many steps.
@@ -171,3 +180,10 @@ class Forced(eqx.Module):
 
 
 System = AbstractHamiltonian | Forced
+
+
+def conservative(system: System) -> AbstractHamiltonian | None:
+    """The Hamiltonian of a system without forces; None where there are some."""
+    if not isinstance(system, Forced):
+        return system
+    return None if system.forces else system.hamiltonian
