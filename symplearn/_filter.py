@@ -11,12 +11,14 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._errors import InputError
 from ._faults import IMPOSSIBLE, SENTENCES, Fault, first_fault, is_fatal, is_remote
 from ._guard import guard
-from ._model import AbstractAffine, AbstractStateSpaceModel, StateSpaceModel, slice_at
+from ._model import AbstractAffine, AbstractStateSpaceModel, StateSpaceModel
+from ._small_products import product
 from ._transforms import STANDARD, AbstractTransform, Moments, Taylor
 from ._triangular import forward_substitution, triangularise
 
@@ -94,8 +96,7 @@ def unscented_filter(
 
     Works under `jit`, `vmap`, `jacfwd` and `grad`. A failure is a value: see `Filtered.fault`; derivatives are then 0.
     """
-    carry, first, later = _run(model, readings, intervals, contexts, transform, keep=True)
-    history = [jnp.concatenate([one[None], rest]) for one, rest in zip(first, later, strict=True)]
+    carry, history = _run(model, readings, intervals, contexts, transform, keep=True)
     # The fields of `_Record` are those of `Filtered` between the first and the faults.
     return Filtered(*(carry.log_likelihood, *history, carry.fault, carry.fault_step))
 
@@ -137,24 +138,36 @@ def _run(model, readings, intervals, contexts, transform, keep):
     model = guard(model)
     mean, root = jnp.asarray(model.initial.mean), model.initial.root
     none = jnp.asarray(int(Fault.NONE))
-    start = _Carry(mean, root, jnp.zeros((), mean.dtype), none, jnp.asarray(-1))
-    predicted = Moments(mean, root, jnp.zeros((mean.shape[0], 0)))
-    carry, first = _measure(model, transform, start, predicted, readings[0], slice_at(contexts, 0), 0)
+    carry = _Carry(mean, root, jnp.zeros((), mean.dtype), none, jnp.asarray(-1))
 
     def step(carry, data):
         reading, interval, context, k = data
         inside, carry = guard((model, carry))
         predicted = inside.predict(transform, carry.mean, carry.root, interval)
-        carry, record = _measure(inside, transform, carry, predicted, reading, context, k)
+        carry, record = _measure(inside, transform, carry, _prior(carry, predicted, k), reading, context, k)
         return carry, (record if keep else None)
 
-    later_contexts = jax.tree.map(lambda leaf: leaf[1:], contexts)
+    # The first reading is of the loop too, where a prediction is computed in vain: outside it would take as long as
+    # twenty readings inside, since only loops are compiled as one function.
+    intervals = jax.tree.map(_repeated_first, intervals)
     # Checkpointing the step makes the gradient faster as well as 16 times smaller (performance.md, A7).
     step = jax.checkpoint(step, prevent_cse=False)
-    counts = jnp.arange(1, readings.shape[0])
-    carry, later = jax.lax.scan(step, carry, (readings[1:], intervals, later_contexts, counts))
+    carry, history = jax.lax.scan(step, carry, (readings, intervals, contexts, np.arange(len(readings))))
     # What a last step leaves in the tangents is past every guard inside.
-    return carry._replace(log_likelihood=guard(carry.log_likelihood)), first, later
+    return carry._replace(log_likelihood=guard(carry.log_likelihood)), history
+
+
+def _repeated_first(leaf: Array) -> Array:
+    """One more entry, before the others; zeros where there are none."""
+    return jnp.concatenate([leaf[:1] if len(leaf) else jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), leaf])
+
+
+def _prior(carry: _Carry, predicted: Moments, k: Array) -> Moments:
+    """What is known before reading k: the prediction, and at k = 0 the initial distribution."""
+    width = max(predicted.factor.shape[1], carry.root.shape[1])
+    factor, root = (jnp.pad(one, ((0, 0), (0, width - one.shape[1]))) for one in (predicted.factor, carry.root))
+    mean = jnp.where(k > 0, predicted.mean, carry.mean)
+    return predicted._replace(mean=mean, factor=jnp.where(k > 0, factor, root))
 
 
 def _measure(model, transform, carry, predicted, reading, context, k):
@@ -174,8 +187,10 @@ def _measure(model, transform, carry, predicted, reading, context, k):
     S_root, G = triangle[:channels, :channels], triangle[channels:, :channels]
     r = jnp.where(seen, jnp.where(seen, reading, 0.0) - mean, 0.0)
     e = forward_substitution(S_root, r)
-    pivots = jnp.where(seen & good[:channels], jnp.diagonal(S_root), 1.0)
-    increment = -0.5 * e @ e - jnp.sum(jnp.log(pivots)) - 0.5 * math.log(2 * math.pi) * jnp.sum(seen)
+    # Not `jnp.diagonal`, whose derivative is a scatter, with which no loop is compiled as one function.
+    diagonal = jnp.sum(jnp.where(np.eye(channels, dtype=bool), S_root, 0.0), axis=1)
+    pivots = jnp.where(seen & good[:channels], diagonal, 1.0)
+    increment = -0.5 * product(e, e) - jnp.sum(jnp.log(pivots)) - 0.5 * math.log(2 * math.pi) * jnp.sum(seen)
     fault = first_fault(
         (jnp.all(jnp.isfinite(m)), Fault.STATE),
         (jnp.all(jnp.isfinite(factor)), Fault.COVARIANCE),
@@ -184,10 +199,10 @@ def _measure(model, transform, carry, predicted, reading, context, k):
         (carry.log_likelihood + increment > IMPOSSIBLE, Fault.UNREACHED),
         (~is_remote(e), Fault.REMOTE),
     )
-    after = _accept(model, carry, m + G @ e, triangle[channels:, channels:], increment, fault, k)
+    after = _accept(model, carry, m + product(G, e), triangle[channels:, channels:], increment, fault, k)
     if_ok = after.log_likelihood - carry.log_likelihood
-    moments = after.mean, after.root @ after.root.T
-    record = _Record(if_ok, m, factor @ factor.T, *moments, r, rows @ rows.T, e, seen)
+    moments = after.mean, product(after.root, after.root.T)
+    record = _Record(if_ok, m, product(factor, factor.T), *moments, r, product(rows, rows.T), e, seen)
     return after, jax.tree.map(_tidy, record)
 
 

@@ -3,7 +3,7 @@
 import abc
 import functools
 import itertools
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,12 +12,14 @@ from jaxtyping import Array, Float
 
 import integrators as ig
 
+from ._small_products import product
+
 
 class AbstractBasis(eqx.Module):
     """Polynomials B_0 = 1, B_1, ... of one variable, from which products over the variables are made."""
 
     @abc.abstractmethod
-    def values(self, z: Float[Array, " variable"], degree: int) -> Float[Array, "power variable"]:
+    def values(self, z: Float[Array, "variable ..."], degree: int) -> Float[Array, "power variable ..."]:
         """B_n(z_i) for n = 0..degree."""
 
     @abc.abstractmethod
@@ -37,8 +39,12 @@ class AbstractBasis(eqx.Module):
 class Monomials(AbstractBasis):
     """1, z, z^2, ..."""
 
-    def values(self, z: Float[Array, " variable"], degree: int) -> Float[Array, "power variable"]:
-        return jnp.cumprod(jnp.concatenate([jnp.ones((1, z.shape[0])), jnp.tile(z, (degree, 1))]), axis=0)
+    def values(self, z: Float[Array, "variable ..."], degree: int) -> Float[Array, "power variable ..."]:
+        # Not `cumprod`, which is a loop of windows that XLA cannot fuse with what is around it.
+        table = [jnp.ones_like(z), z]
+        for n in range(1, degree):
+            table.append(table[n] * z)
+        return jnp.stack(table[: degree + 1])
 
     def slopes(self, degree: int) -> np.ndarray:
         return np.diag(np.arange(1.0, degree + 1), k=-1)
@@ -64,8 +70,8 @@ class Legendre(AbstractBasis):
     def scales(self, variables: int) -> Float[Array, " variable"]:
         return jnp.broadcast_to(jnp.asarray(self.box, dtype=float), (variables,))
 
-    def values(self, z: Float[Array, " variable"], degree: int) -> Float[Array, "power variable"]:
-        x = z / self.scales(z.shape[0])
+    def values(self, z: Float[Array, "variable ..."], degree: int) -> Float[Array, "power variable ..."]:
+        x = z / self.scales(z.shape[0]).reshape(-1, *[1] * (z.ndim - 1))
         table = [jnp.ones_like(x), x]
         for n in range(1, degree):
             table.append(((2 * n + 1) * x * table[n] - n * table[n - 1]) / (n + 1))
@@ -136,12 +142,12 @@ def _places(variables: int, degree: int) -> np.ndarray:
 
 
 def _polynomial(basis: AbstractBasis, coefficients: Array, z: Array, degree: int) -> Array:
-    return coefficients @ _products(basis, z, degree)[_places(z.shape[0], degree)]
+    return product(coefficients, _products(basis, z, degree)[_places(z.shape[0], degree)])
 
 
 def _weights(basis: AbstractBasis, coefficients: Array, variables: int, degree: int) -> Array:
     """What the gradient's components (variable, lower term) are made of: the same all along a trajectory."""
-    table = jnp.asarray(_derivative_table(basis, variables, degree)) @ coefficients
+    table = jnp.sum(jnp.asarray(_derivative_table(basis, variables, degree)) * coefficients, axis=-1)
     return table / basis.scales(variables)[:, None]
 
 
@@ -151,17 +157,19 @@ class _PreparedPotential(ig.AbstractSeparableHamiltonian):
     of: "PolynomialPotential"
     weights: Float[Array, "variable term"]
 
+    side_by_side: ClassVar[bool] = True
+
     def kinetic(self, p: Float[Array, " d"]) -> Float[Array, ""]:
         return self.of.kinetic(p)
 
     def potential(self, q: Float[Array, " d"]) -> Float[Array, ""]:
         return self.of.potential(q)
 
-    def velocity(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
+    def velocity(self, q: Float[Array, "d ..."], p: Float[Array, "d ..."]) -> Float[Array, "d ..."]:
         return p
 
-    def slope(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
-        return self.weights @ _products(self.of.basis, q, self.of.degree - 1)
+    def slope(self, q: Float[Array, "d ..."], p: Float[Array, "d ..."]) -> Float[Array, "d ..."]:
+        return product(self.weights, _products(self.of.basis, q, self.of.degree - 1))
 
 
 class _Prepared(ig.AbstractHamiltonian):
@@ -170,18 +178,20 @@ class _Prepared(ig.AbstractHamiltonian):
     of: "Polynomial"
     weights: Float[Array, "variable term"]
 
+    side_by_side: ClassVar[bool] = True
+
     def energy(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, ""]:
         return self.of.energy(q, p)
 
-    def velocity(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
+    def velocity(self, q: Float[Array, "d ..."], p: Float[Array, "d ..."]) -> Float[Array, "d ..."]:
         return self.vector_field(jnp.concatenate([q, p]))[: self.of.dim]
 
-    def slope(self, q: Float[Array, " d"], p: Float[Array, " d"]) -> Float[Array, " d"]:
+    def slope(self, q: Float[Array, "d ..."], p: Float[Array, "d ..."]) -> Float[Array, "d ..."]:
         return -self.vector_field(jnp.concatenate([q, p]))[self.of.dim :]
 
-    def vector_field(self, x: Float[Array, " two_d"]) -> Float[Array, " two_d"]:
+    def vector_field(self, x: Float[Array, "two_d ..."]) -> Float[Array, "two_d ..."]:
         """dx/dt at the phase point x, by one gradient."""
-        slope, velocity = ig.split(self.weights @ _products(self.of.basis, x, self.of.degree - 1))
+        slope, velocity = ig.split(product(self.weights, _products(self.of.basis, x, self.of.degree - 1)))
         return jnp.concatenate([velocity, -slope])
 
 
@@ -231,7 +241,7 @@ class PolynomialPotential(ig.AbstractSeparableHamiltonian):
         return _terms(self.basis, _names("q", self.dim), self.degree)
 
     def kinetic(self, p: Float[Array, " d"]) -> Float[Array, ""]:
-        return 0.5 * p @ p
+        return 0.5 * product(p, p)
 
     def potential(self, q: Float[Array, " d"]) -> Float[Array, ""]:
         return _polynomial(self.basis, self.coefficients, q, self.degree)

@@ -14,7 +14,8 @@ import integrators as ig
 from ._errors import InputError
 from ._noise import enter
 from ._parameters import AbstractKnown
-from ._transforms import AbstractTransform, Moments
+from ._small_products import product
+from ._transforms import AbstractTransform, Images, Moments
 from ._triangular import semidefinite_cholesky
 
 
@@ -72,6 +73,10 @@ class AbstractAffine(eqx.Module):
     def slope(self, x: Float[Array, " state"]) -> Float[Array, "output state"]:
         """The matrix that multiplies the state; `x` gives the state's size only."""
 
+    def carried(self, root: Float[Array, "state column"]) -> Float[Array, "output column"]:
+        """The matrix times a square root of the state's covariance."""
+        return product(self.slope(root[:, 0]), root)
+
     @abc.abstractmethod
     def __call__(self, x: Float[Array, " state"], context: Any = None) -> Float[Array, " output"]:
         """The map itself."""
@@ -90,7 +95,7 @@ class LinearDynamics(AbstractAffine):
         return jnp.asarray(self.A)
 
     def __call__(self, x: Float[Array, " state"], interval: Any = None) -> Float[Array, " state"]:
-        return self.A @ x + _driven(self.B, interval, x.shape[0], "LinearDynamics")
+        return product(jnp.asarray(self.A), x) + _driven(self.B, interval, x.shape[0], "LinearDynamics")
 
 
 def _driven(matrix: Any, context: Any, size: int, owner: str) -> Array:
@@ -102,7 +107,7 @@ def _driven(matrix: Any, context: Any, size: int, owner: str) -> Array:
         raise InputError(
             f"`{owner}` has an input matrix, but the recording has no inputs; give `TimeSeries` its `inputs`."
         )
-    return matrix @ given
+    return product(jnp.asarray(matrix), given)
 
 
 class Propagator(eqx.Module):
@@ -128,12 +133,22 @@ class Propagator(eqx.Module):
     def __call__(self, x: Float[Array, " state"], interval: Interval) -> Float[Array, " state"]:
         return ig.propagate(self.system, self.integrator, x, interval.start, interval.end, self.substeps)
 
+    def side_by_side(self, points: Float[Array, "state point"], interval: Interval) -> Float[Array, "state point"]:
+        """Many states over the same data interval."""
+        prepared = self.system.prepared()
+        if getattr(prepared, "side_by_side", False):
+            return ig.propagate(prepared, self.integrator, points, interval.start, interval.end, self.substeps)
+        return jax.vmap(self, in_axes=(1, None), out_axes=1)(points, interval)
+
 
 class FullState(AbstractAffine):
     """The whole state is read: h(x) = x."""
 
     def slope(self, x: Float[Array, " state"]) -> Float[Array, "state state"]:
         return jnp.eye(x.shape[0])
+
+    def carried(self, root: Float[Array, "state column"]) -> Float[Array, "state column"]:
+        return root
 
     def __call__(self, x: Float[Array, " state"], context: Any = None) -> Float[Array, " state"]:
         return x
@@ -164,7 +179,7 @@ class LinearObservation(AbstractAffine):
         return jnp.asarray(self.matrix)
 
     def __call__(self, x: Float[Array, " state"], context: Any = None) -> Float[Array, " channel"]:
-        reading = self.matrix @ x
+        reading = product(jnp.asarray(self.matrix), x)
         return reading + _driven(self.feedthrough, context, reading.shape[0], "LinearObservation")
 
 
@@ -236,8 +251,9 @@ class StateSpaceModel(AbstractStateSpaceModel):
 def _pass(transform: AbstractTransform, part: Any, mean: Array, root: Array, record: Any) -> Moments:
     """Moments of one part of a model, exact where it is affine."""
     if isinstance(part, AbstractAffine):
-        return Moments(part(mean, record), part.slope(mean) @ root, root)
-    return transform(lambda x: part(x, record), mean, root)
+        return Moments(part(mean, record), part.carried(root), root)
+    images = getattr(part, "side_by_side", None)
+    return transform(Images(lambda x: part(x, record), images and (lambda points: images(points, record))), mean, root)
 
 
 def slice_at(records: PyTree, k: int | Int[Array, ""]) -> PyTree:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from ._errors import InputError
 from ._parameters import AbstractKnown, AbstractParameter
+from ._small_products import product
 from ._transforms import Moments, with_noise
 from ._triangular import semidefinite_cholesky
 
@@ -217,7 +218,7 @@ class Multiplicative(AbstractNoise):
             second = moments.mean**2 + jnp.sum(moments.factor**2, axis=1)
             multiplied = with_noise(scaled, _root(second)[:, None] * structure.root)
         else:
-            second = jnp.outer(moments.mean, moments.mean) + moments.factor @ moments.factor.T
+            second = jnp.outer(moments.mean, moments.mean) + product(moments.factor, moments.factor.T)
             # Semi-definite by Schur's product theorem.
             multiplied = with_noise(scaled, semidefinite_cholesky(second * structure.matrix))
         return multiplied if self.additive is None else enter(self.additive, multiplied, interval)

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._small_products import product
+
 # Points of a Gauss-Hermite grid beyond which a particle filter would be the better tool.
 _MOST_POINTS = 50_000
 
@@ -34,7 +36,25 @@ class Moments(NamedTuple):
     @property
     def covariance(self) -> Float[Array, "output output"]:
         """Var[f]."""
-        return self.factor @ self.factor.T
+        return product(self.factor, self.factor.T)
+
+
+class Images:
+    """A function with a way of its own, which may be None, to its images of many points at once, side by side."""
+
+    def __init__(self, function: Callable[[Any], Any], side_by_side: Callable[[Any], Any] | None = None):
+        self.function, self.own = function, side_by_side
+
+    def __call__(self, x: Float[Array, " state"]) -> Float[Array, " output"]:
+        return self.function(x)
+
+    def side_by_side(self, points: Float[Array, "state point"]) -> Float[Array, "output point"]:
+        """The images of the columns."""
+        return (self.own or jax.vmap(self.function, in_axes=1, out_axes=1))(points)
+
+
+def _images(function: Callable[[Any], Any], points: Float[Array, "state point"]) -> Float[Array, "output point"]:
+    return (function if isinstance(function, Images) else Images(function)).side_by_side(points)
 
 
 def with_noise(moments: Moments, *factors: Float[Array, "output _"]) -> Moments:
@@ -86,15 +106,15 @@ class UnscentedTransform(AbstractTransform):
 
     def __call__(self, function, mean, root) -> Moments:
         dim = mean.shape[0]
-        half = math.sqrt(self.spread(dim)) * root.T
-        outputs = jax.vmap(function)(jnp.concatenate([mean[None], mean + half, mean - half]))
-        deviations = outputs[1:] - outputs[0]
+        centre, half = mean[:, None], math.sqrt(self.spread(dim)) * root
+        outputs = _images(function, jnp.concatenate([centre, centre + half, centre - half], axis=1))
+        deviations = outputs[:, 1:] - outputs[:, :1]
         weight = 0.5 / self.spread(dim)
-        shift = weight * jnp.sum(deviations, axis=0)
+        shift = weight * jnp.sum(deviations, axis=1)
         # sum_i w_i (D_i - shift)(D_i - shift)' with sum_i w_i = 2 + beta - alpha^2 and a zero centre difference.
         rest = math.sqrt(self.beta - self.alpha**2) * shift
         odd, even = _halves(deviations, math.sqrt(weight))
-        return _collected(outputs[0] + shift, root, odd, even, rest[:, None])
+        return _collected(outputs[:, 0] + shift, root, odd, even, rest[:, None])
 
 
 STANDARD = UnscentedTransform()
@@ -109,10 +129,10 @@ class Cubature(AbstractTransform):
 
     def __call__(self, function, mean, root) -> Moments:
         dim = mean.shape[0]
-        half = math.sqrt(dim) * root.T
-        outputs = jax.vmap(function)(jnp.concatenate([mean + half, mean - half]))
-        average = jnp.mean(outputs, axis=0)
-        odd, even = _halves(outputs - average, math.sqrt(0.5 / dim))
+        centre, half = mean[:, None], math.sqrt(dim) * root
+        outputs = _images(function, jnp.concatenate([centre + half, centre - half], axis=1))
+        average = jnp.mean(outputs, axis=1)
+        odd, even = _halves(outputs - average[:, None], math.sqrt(0.5 / dim))
         return _collected(average, root, odd, even)
 
 
@@ -149,11 +169,11 @@ class GaussHermite(AbstractTransform):
                 "`UnscentedTransform`."
             )
         nodes, roots = _hermite_grid(self.order, dim)
-        offsets = jnp.asarray(nodes) @ root.T
-        outputs = jax.vmap(function)(mean + offsets)
-        average = jnp.asarray(roots**2) @ outputs
-        factor = (jnp.asarray(roots)[:, None] * (outputs - average)).T
-        return Moments(average, factor, (jnp.asarray(roots)[:, None] * offsets).T)
+        offsets = product(root, jnp.asarray(nodes.T))
+        outputs = _images(function, mean[:, None] + offsets)
+        average = product(outputs, jnp.asarray(roots**2))
+        factor = jnp.asarray(roots) * (outputs - average[:, None])
+        return Moments(average, factor, jnp.asarray(roots) * offsets)
 
 
 @functools.cache
@@ -167,9 +187,9 @@ def _hermite_grid(order: int, dim: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _halves(deviations: Array, root_weight: float) -> tuple[Array, Array]:
     """Columns of the odd and the even part of opposite points: x correlates with the odd ones only."""
-    plus, minus = jnp.split(deviations, 2)
+    plus, minus = jnp.split(deviations, 2, axis=1)
     scale = root_weight / math.sqrt(2.0)
-    return scale * (plus - minus).T, scale * (plus + minus).T
+    return scale * (plus - minus), scale * (plus + minus)
 
 
 def _collected(mean: Array, root: Array, odd: Array, *rest: Array) -> Moments:

@@ -7,7 +7,10 @@ seen to hang on two cores (jaxlib 0.10.2).
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
+
+from ._small_products import product
 
 # Squared length of what is left of a row, over that of the row: below it, only round-off is left.
 _SPENT = 1e-26
@@ -26,23 +29,29 @@ def triangularise(rows: Float[Array, "size column"]) -> tuple[Float[Array, "size
     positive semidefinite whatever happens. A row that depends on those before it gets a zero column.
     """
     size = rows.shape[0]
-    order = jnp.arange(size)
 
     def column(rest, data):
-        j, scale = data
-        row = rest[j]
-        square = row @ row
+        j, here, below, scale = data
+        row = _entry(rest, j)
+        square = product(row, row)
         good = square > _SPENT * scale
         length = jnp.sqrt(jnp.where(good, square, 1.0))
         direction = jnp.where(good, row / length, 0.0)
-        entries = jnp.where(order > j, rest @ direction, 0.0)
-        entries = jnp.where((order == j) & good, length, entries)
+        entries = jnp.where(below, product(rest, direction), 0.0)
+        entries = jnp.where(here & good, length, entries)
         return rest - jnp.outer(entries, direction), (entries, good)
 
     # Rows of very different size are the rule (a precise channel beside a coarse one), so each is judged by its own.
     scales = jax.lax.stop_gradient(jnp.sum(rows**2, axis=1))
-    _, (columns, good) = jax.lax.scan(column, rows, (order, scales), unroll=min(size, _FLAT))
+    # Constants, or XLA would compute them anew at each call.
+    data = np.arange(size), np.eye(size, dtype=bool), np.tri(size, k=-1, dtype=bool).T, scales
+    _, (columns, good) = jax.lax.scan(column, rows, data, unroll=min(size, _FLAT))
     return columns.T, good
+
+
+def _entry(array: Array, j: Array) -> Array:
+    """array[j], for a j that is not negative: its sign would be computed each time, by a kernel of its own."""
+    return jax.lax.dynamic_index_in_dim(array, j, keepdims=False, allow_negative_indices=False)
 
 
 def forward_substitution(L: Float[Array, "size size"], vector: Float[Array, " size"]) -> Float[Array, " size"]:
@@ -51,10 +60,11 @@ def forward_substitution(L: Float[Array, "size size"], vector: Float[Array, " si
 
     def entry(rest, data):
         j, below = data
-        value = rest[j] / jnp.where(below[j] > 0.0, below[j], 1.0)
+        pivot = _entry(below, j)
+        value = _entry(rest, j) / jnp.where(pivot > 0.0, pivot, 1.0)
         return rest - value * below, value
 
-    return jax.lax.scan(entry, vector, (jnp.arange(size), L.T), unroll=min(size, _FLAT))[1]
+    return jax.lax.scan(entry, vector, (np.arange(size), L.T), unroll=min(size, _FLAT))[1]
 
 
 def lower_inverse(L: Float[Array, "size size"]) -> Float[Array, "size size"]:
@@ -69,15 +79,17 @@ def semidefinite_cholesky(covariance: Float[Array, "state state"]) -> Float[Arra
     that is clearly indefinite gives NaN, which the filter reports.
     """
     size = covariance.shape[0]
-    order = jnp.arange(size)
+    order = np.arange(size)
     scales = jax.lax.stop_gradient(jnp.abs(jnp.diagonal(covariance)))
 
     def column(rest, j):
-        pivot, below = rest[j, j], jnp.where(order >= j, rest[:, j], 0.0)
-        good = pivot > _SINGULAR * scales[j]
-        spoilt = ~good & jnp.any(jnp.abs(below) > _INDEFINITE * jnp.sqrt(scales * scales[j]))
+        # `rest` stays symmetric.
+        row, scale = _entry(rest, j), _entry(scales, j)
+        pivot, below = _entry(row, j), jnp.where(order >= j, row, 0.0)
+        good = pivot > _SINGULAR * scale
+        spoilt = ~good & jnp.any(jnp.abs(below) > _INDEFINITE * jnp.sqrt(scales * scale))
         root = jnp.sqrt(jnp.where(good, pivot, 1.0))
         entries = jnp.where(good, below / root, jnp.where(spoilt, jnp.nan, 0.0))
         return rest - jnp.outer(entries, entries), entries
 
-    return jax.lax.scan(column, covariance, order, unroll=min(size, _FLAT))[1].T
+    return jax.lax.scan(column, covariance, np.arange(size))[1].T
