@@ -1,0 +1,115 @@
+"""What is written for speed has the value, the slope and the curvature of what it stands for."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import integrators as ig
+import symplearn as sl
+from integrators.problems import HarmonicOscillator, HenonHeiles
+from symplearn._log_posterior import guarded
+from symplearn._small_products import SMALL, product
+
+
+def assert_same_in_value_and_derivatives(fast, plain, at):
+    for one, other in ((fast, plain), (jax.jacrev(fast), jax.jacrev(plain)), (jax.hessian(fast), jax.hessian(plain))):
+        np.testing.assert_allclose(one(at), other(at), rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [((3,), (3,)), ((2, 3), (3,)), ((2, 3), (3, 4)), ((3,), (3, 2)), ((2, SMALL + 1), (SMALL + 1, 2))],
+)
+def test_a_small_product_is_the_product(left, right):
+    """Of vectors and matrices, on both sides of the size from which on it is the library's."""
+    random = np.random.default_rng(0)
+    right = jnp.asarray(random.normal(size=right))
+    assert_same_in_value_and_derivatives(
+        lambda x: product(x, right), lambda x: x @ right, jnp.asarray(random.normal(size=left))
+    )
+
+
+class Driven(ig.AbstractSeparableHamiltonian):
+    """A spring whose stiffness grows with time."""
+
+    time: float = 0.0
+
+    def kinetic(self, p):
+        return 0.5 * p @ p
+
+    def potential(self, q):
+        return 0.5 * (1.0 + self.time) * q @ q
+
+    def at(self, t):
+        return Driven(t)
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        HenonHeiles(),
+        ig.Forced(HenonHeiles()),
+        ig.Forced(HenonHeiles(), (ig.ViscousDamping(0.3), ig.CoulombFriction(0.1))),
+        Driven(),
+    ],
+    ids=["alone", "without forces", "with forces", "changing in time"],
+)
+def test_leapfrog_over_many_steps_is_its_steps(system):
+    """Half kicks that meet are one force, where that is the same: not with friction, nor where the system changes."""
+
+    def steps(x):
+        for k in range(3):
+            x = ig.Leapfrog().step(system, x, 0.5 + 0.2 * k, 0.2)
+        return x
+
+    start = jnp.array([0.2, -0.25, 0.3, -0.25])
+    assert_same_in_value_and_derivatives(lambda x: ig.advance(system, ig.Leapfrog(), x, 0.5, 1.1, 3), steps, start)
+
+
+@pytest.mark.parametrize(
+    ("system", "integrator"),
+    [
+        (sl.PolynomialPotential(2, 3, 0.1 * np.arange(9.0)), ig.Leapfrog()),
+        (sl.PolynomialPotential(2, 4, 0.1 * np.arange(14.0), sl.Legendre((1.5, 2.0))), ig.yoshida4(ig.Leapfrog())),
+        (sl.Polynomial(2, 3, 0.1 * np.sin(np.arange(34.0))), ig.Tao()),
+        (sl.Polynomial(1, 2, 0.1 * np.arange(5.0)), ig.Tao(projection=ig.FirstCopy())),
+        (HenonHeiles(), ig.RK2()),
+    ],
+    ids=["leapfrog", "composed, Legendre", "Tao", "Tao, first copy", "a system of one's own"],
+)
+def test_points_side_by_side_go_where_each_goes_alone(system, integrator):
+    """The propagator of many points in columns is that of each."""
+    d = 2 if getattr(system, "dim", 2) == 2 else 1
+    points = 0.3 * jnp.asarray(np.random.default_rng(1).normal(size=(2 * d, 5)))
+    propagator = sl.Propagator(system, integrator, 2)
+    interval = sl.Interval(jnp.asarray(0.0), jnp.asarray(0.2))
+    assert_same_in_value_and_derivatives(
+        lambda x: propagator.side_by_side(x, interval),
+        lambda x: jax.vmap(lambda one: propagator(one, interval), in_axes=1, out_axes=1)(x),
+        points,
+    )
+
+
+def test_one_reading_is_a_recording():
+    """Without a single interval the likelihood is that of the first reading alone."""
+    model = sl.StateSpaceModel(
+        sl.Propagator(HarmonicOscillator(), ig.Leapfrog()),
+        sl.FullState(),
+        sl.AdditiveGaussian(sl.ScaledIdentity(1e-2, 2)),
+        sl.AdditiveGaussian(sl.ScaledIdentity(1.0, 2)),
+        sl.Gaussian(jnp.zeros(2), 3.0 * jnp.eye(2)),
+    )
+    score = sl.MarginalLikelihood().score(model, sl.TimeSeries(jnp.zeros(1), jnp.array([[1.0, 2.0]])))
+    assert float(score) == pytest.approx(np.log(2 * np.pi) + np.log(4.0) + 5.0 / 8.0, rel=1e-12)
+
+
+def test_forward_and_reverse_mode_agree():
+    """The guarded score's slope, by whichever mode, is that of the score."""
+
+    def score(x):
+        return jnp.sum(jnp.sin(x) * jnp.arange(1.0, 1.0 + x.size))
+
+    for size in (1, 2, 13):
+        at = jnp.linspace(0.1, 1.0, size)
+        np.testing.assert_allclose(jax.grad(guarded(score, size))(at), jax.grad(score)(at), rtol=1e-12)
