@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from symplearn.diagnosis._strength import WIDTHS, mixture_gain
+from symplearn.diagnosis._strength import WIDTHS, mixture_gain, turning_gain
 
 NONE = -np.inf
 
@@ -91,3 +91,30 @@ def test_what_the_recording_cannot_show_gains_nothing():
     """Where the estimate is nearly as wide as its prior there are no narrower priors to speak of."""
     centre, spread = posterior(np.array([0.3]), np.array([[0.5]]))
     assert mixture_gain(centre, spread, np.zeros(1, int), np.full(1, NONE)) == 0.0
+
+
+@pytest.mark.parametrize("told", [(0.05, 0.09), (0.0, 0.1), (0.1, 0.02)], ids=["drives", "only damps", "turns far out"])
+def test_a_self_excitation_turns_where_the_motion_is(told):
+    """Its c is of any order of magnitude, its ln a within ln 2 of the motion's: SciPy's quadrature over both."""
+    scales, sd, correlation = np.array([0.3, 0.5]), np.array([0.02, 0.03]), 0.6
+    likelihood = np.outer(sd, sd) * np.array([[1.0, correlation], [correlation, 1.0]])
+    spread = np.linalg.inv(np.linalg.inv(likelihood) + np.diag(scales**-2.0))
+    centre = spread @ np.linalg.solve(likelihood, np.array(told))
+    widths = np.geomspace(4 * np.sqrt(spread[0, 0]) / scales[0], 1.0, WIDTHS)
+    seen = stats.multivariate_normal(np.array(told), likelihood)
+
+    def integral(prior, low, high):
+        density = lambda y, x: seen.pdf([x, np.exp(y)]) * prior(x, np.exp(y)) * np.exp(y)  # noqa: E731
+        return integrate.dblquad(density, 0.0, 0.3, low, high, epsabs=0, epsrel=1e-4)[0]
+
+    def independent(c, e):
+        return 4 * stats.norm.pdf(c, scale=scales[0]) * stats.norm.pdf(e, scale=scales[1])
+
+    def turning(c, e):
+        strength = 2 * np.mean(stats.norm.pdf(c, scale=widths * scales[0]))
+        a, motion = np.sqrt(c / e), np.sqrt(scales[0] / scales[1])
+        return strength * stats.lognorm.pdf(a, np.log(2), scale=motion) * a / (2 * e)
+
+    expected = np.log(integral(turning, np.log(1e-4), np.log(0.4)) / integral(independent, np.log(1e-7), np.log(0.4)))
+    # The grid of the gain is a twelfth of a standard deviation wide and the density has an edge at c = 0.
+    assert turning_gain(centre, spread, scales) == pytest.approx(expected, abs=0.05)

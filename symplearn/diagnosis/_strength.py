@@ -11,8 +11,9 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 from scipy.special import logsumexp
+from scipy.stats import norm
 
-from .._effects import HIDDEN
+from .._effects import EXCITATION, HIDDEN
 from ._calibrate import Priors
 from ._evidence import orthants
 from ._problem import Combination, Problem
@@ -20,6 +21,10 @@ from ._problem import Combination, Problem
 # Widths of the mixture, and the narrowest of them in standard deviations of the estimate: an effect that no recording
 # of this kind could show is not what is asked for.
 WIDTHS, _SEEN = 7, 4.0
+# Standard deviation of the logarithm of where a self-excitation turns into a damping, about the size of the motion.
+_TURNING = np.log(2.0)
+# The grid that integrates over it, in standard deviations of the estimate.
+_REACH, _POINTS = 5.0, 121
 # What the recording says of a direction is at least this share of what the prior says.
 _SILENT = 1e-9
 
@@ -29,16 +34,47 @@ def strength_gain(
     covariance: Float[np.ndarray, "z z"],
 ) -> float:  # fmt: skip
     """Log evidence under unknown orders of magnitude, less that under the widest priors, whose posterior is given."""
-    blocks = [entries for member in combination if len(entries := _entries(problem, combination, member))]
+    total, blocks = 0.0, []
+    for member in combination:
+        entries = _entries(problem, combination, member)
+        if problem.candidate(member).effect is EXCITATION:
+            total += turning_gain(
+                z[entries], covariance[np.ix_(entries, entries)], priors.scales[problem.candidate(member).values]
+            )
+        elif len(entries):
+            blocks.append(entries)
     if not blocks:
-        return 0.0
+        return total
     a, own = np.concatenate(blocks), np.repeat(np.arange(len(blocks)), [len(b) for b in blocks])
     unit = priors.precision_of(problem, combination)[a] ** -0.5
     centre = (z - priors.mean_of(problem, combination))[a] / unit
     spread = covariance[np.ix_(a, a)] / np.outer(unit, unit)
     bounds = problem.lower_bounds(combination)
     lowest = np.array([bounds.get(int(k), -np.inf) for k in a]) / unit
-    return mixture_gain(centre, spread, own, lowest)
+    return total + mixture_gain(centre, spread, own, lowest)
+
+
+def turning_gain(centre: np.ndarray, spread: np.ndarray, scales: np.ndarray) -> float:
+    """The same for a self-excitation c (1 - q^2/a^2) v, inside c v - e q^2 v, whose a is about where the motion is.
+
+    Of c and e each for itself, most would be dampings that grow with q^2 and drive nothing.
+    """
+    size = np.geomspace(max(min(_SEEN * np.sqrt(spread[0, 0]) / scales[0], 1.0), 1e-12), 1.0, WIDTHS)
+    root = np.linalg.cholesky(spread + np.diag(1e-12 * np.diag(spread) + 1e-300))
+    grid = np.linspace(-_REACH, _REACH, _POINTS)
+    normal = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
+    points = centre + normal @ root.T
+    inside = (points > 0).all(1)
+    if not inside.any():
+        return 0.0
+    c, e = points[inside].T
+    mass = norm.logpdf(normal[inside]).sum(1)
+    a = np.sqrt(c / e)
+    # Density of e given c: that of ln a, by |d ln a / d e| = 1 / (2 e).
+    turning = norm.logpdf(np.log(a), 0.5 * np.log(scales[0] / scales[1]), _TURNING) - np.log(2 * e)
+    strength = logsumexp(norm.logpdf(c[:, None], scale=size * scales[0]), axis=1) - np.log(WIDTHS)
+    wide = norm.logpdf(c, scale=scales[0]) + norm.logpdf(e, scale=scales[1]) + np.log(2.0)
+    return float(logsumexp(mass + turning + strength - wide) - logsumexp(mass))
 
 
 def _entries(problem: Problem, combination: Combination, member: int) -> np.ndarray:
