@@ -5,6 +5,7 @@ along the columns of a lower Cholesky factor and are drawn again before the meas
 squared norm. The filter carries a square root of the state's covariance, which no round-off can make indefinite.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -21,6 +22,9 @@ from ._model import AbstractAffine, AbstractStateSpaceModel, StateSpaceModel
 from ._small_products import product
 from ._transforms import STANDARD, AbstractTransform, Moments, Taylor
 from ._triangular import forward_substitution, triangularise
+
+# Bytes of the states of all readings beyond which a gradient does not keep all of them, but takes a third longer.
+_KEPT = 2_000_000
 
 
 class Filtered(eqx.Module):
@@ -147,14 +151,40 @@ def _run(model, readings, intervals, contexts, transform, keep):
         carry, record = _measure(inside, transform, carry, _prior(carry, predicted, k), reading, context, k)
         return carry, (record if keep else None)
 
-    # The first reading is of the loop too, where a prediction is computed in vain: outside it would take as long as
-    # twenty readings inside, since only loops are compiled as one function.
-    intervals = jax.tree.map(_repeated_first, intervals)
     # Checkpointing the step makes the gradient faster as well as 16 times smaller (performance.md, A7).
     step = jax.checkpoint(step, prevent_cse=False)
-    carry, history = jax.lax.scan(step, carry, (readings, intervals, contexts, np.arange(len(readings))))
+    if keep or len(readings) * sum(leaf.nbytes for leaf in carry) <= _KEPT:
+        # The first reading is of the loop too, where a prediction is computed in vain: outside it would take as long as
+        # twenty readings inside, since only loops are compiled as one function.
+        intervals = jax.tree.map(_repeated_first, intervals)
+        carry, history = jax.lax.scan(step, carry, (readings, intervals, contexts, np.arange(len(readings))))
+    else:
+        carry, history = _in_stretches(step, carry, (readings, contexts), intervals), None
     # What a last step leaves in the tangents is past every guard inside.
     return carry._replace(log_likelihood=guard(carry.log_likelihood)), history
+
+
+def _in_stretches(step, carry, of_readings, intervals):
+    """The carry after all readings, whose derivative keeps only that at the start of every stretch of sqrt(n).
+
+    Each stretch is taken out of the recording when its turn comes: a copy of all of it would be larger than what is
+    saved. The last one may be longer than what is left, and does nothing there.
+    """
+    count = len(of_readings[0])
+    length = math.isqrt(count - 1) + 1
+
+    @functools.partial(jax.checkpoint, prevent_cse=False)
+    def stretch(carry, begin):
+        places = begin + np.arange(length)
+        readings, contexts = jax.tree.map(lambda leaf: jnp.take(leaf, places, axis=0, mode="clip"), of_readings)
+        inside = jax.tree.map(lambda leaf: jnp.take(leaf, places - 1, axis=0, mode="clip"), intervals)
+        return jax.lax.scan(within, carry, (readings, inside, contexts, places))[0], None
+
+    def within(carry, data):
+        after, _ = step(carry, data)
+        return jax.tree.map(lambda new, old: jnp.where(data[-1] < count, new, old), after, carry), None
+
+    return jax.lax.scan(stretch, carry, np.arange(0, count, length))[0]
 
 
 def _repeated_first(leaf: Array) -> Array:

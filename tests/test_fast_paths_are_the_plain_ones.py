@@ -8,7 +8,9 @@ import pytest
 import integrators as ig
 import symplearn as sl
 from integrators.problems import HarmonicOscillator, HenonHeiles
+from symplearn import _filter
 from symplearn._log_posterior import guarded
+from symplearn._model import intervals_between
 from symplearn._small_products import SMALL, product
 
 
@@ -102,6 +104,38 @@ def test_one_reading_is_a_recording():
     )
     score = sl.MarginalLikelihood().score(model, sl.TimeSeries(jnp.zeros(1), jnp.array([[1.0, 2.0]])))
     assert float(score) == pytest.approx(np.log(2 * np.pi) + np.log(4.0) + 5.0 / 8.0, rel=1e-12)
+
+
+@pytest.mark.parametrize("escapes", [False, True], ids=["sound", "failing"])
+def test_a_long_recording_in_stretches_is_the_same(monkeypatch, escapes):
+    """Whether a gradient keeps the state at every reading or at every sqrt(n)-th one, value and slopes are the same."""
+    random = np.random.default_rng(0)
+    times, inputs = jnp.arange(23.0) * 0.1, jnp.asarray(random.normal(size=(23, 1)))
+    readings = random.normal(size=(23, 2))
+    readings[4] = np.nan
+    readings[15, 1] = np.nan
+
+    def score(x, readings):
+        start = jnp.where(escapes, 1e200, 0.3)
+        model = sl.StateSpaceModel(
+            sl.Propagator(sl.PolynomialPotential(1, 3, jnp.concatenate([x[:2], x[:1]])), ig.Leapfrog(), 2),
+            sl.LinearObservation(jnp.array([[1.0, 0.0], [0.5, 1.0]]), x[2] * jnp.array([[1.0], [0.0]])),
+            sl.AdditiveGaussian(sl.ScaledIdentity(jnp.exp(x[3]), 2)),
+            sl.AdditiveGaussian(sl.ScaledIdentity(0.5, 2)),
+            sl.Gaussian(start * jnp.ones(2), jnp.eye(2)),
+        )
+        return sl.log_likelihood(model, readings, intervals_between(times, inputs), sl.Instant(times, inputs))
+
+    at = jnp.array([0.3, 0.8, 0.4, -3.0]), jnp.asarray(readings)
+    found = []
+    for kept in (0, 10**9):
+        monkeypatch.setattr(_filter, "_KEPT", kept)
+        value, slopes = jax.value_and_grad(lambda *both: score(*both), (0, 1))(*at)
+        found.append((value, *slopes, jax.hessian(lambda x: score(x, at[1]))(at[0])))
+    assert (float(found[0][0]) == -1e15) is escapes
+    assert escapes or not np.any(np.asarray(found[0][1]) == 0.0)
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
 
 
 def test_forward_and_reverse_mode_agree():
