@@ -24,7 +24,7 @@ from ._weigher import KEPT, Weigher
 # Combinations of one size are carried on to the next size while within this many nats of the best.
 _REACH = 30.0
 # Combinations that are extended, most larger ones that are fitted, and what a larger one must gain to go on.
-_BASES, _PAIRS, _WORTH = 4, 24, 2.0
+_BASES, _PAIRS, _WORTH = 4, 32, 2.0
 # Nats by which a missing force may lead for effects to count as small, and how many of those are then fitted.
 _QUIET, _SMALL = 3.0, 24
 # Combinations that a missing force is tried beside.
@@ -229,20 +229,24 @@ class Search:
         best = [c for c in self.found.estimates if self._size(c) == size - 1]
         best = sorted(best, key=self.found.best, reverse=True)
         top = self.found.best(best[0]) if best else -np.inf
-        listed: list[Start] = []
+        kept: dict[tuple[Combination, int], Start] = {}
         for k, c in enumerate([c for c in best if self.found.best(c) > top - _REACH][:_BASES]):
             white = self.found.of(c, "white")
             assert white is not None  # every combination is weighed under white noise first
             # Thinned frequencies miss an oscillation that stays in tune throughout, so the best one has more of them.
             mine = self._scanned(c, white.z, _FEW if k else _MANY)
-            listed += [replace(start, gain=start.gain + self.found.best(c)) for start in mine]
-        listed.sort(key=lambda start: -start.gain)
-        kept: dict[tuple[Combination, int], Start] = {}
-        for start in listed:
+            promised = [replace(start, gain=start.gain + white.log_evidence) for start in mine]
+            # As many of each: what a score promises about a poor fit is too much.
+            self._keep(promised, kept)
+        return sorted(kept.values(), key=lambda start: -start.gain)
+
+    def _keep(self, listed: Sequence[Start], kept: dict[tuple[Combination, int], Start]) -> None:
+        """Add the best of some starts, each combination from two places at most."""
+        most = len(kept) + _PAIRS // _BASES
+        for start in sorted(listed, key=lambda start: -start.gain):
             tried = sum(combination == start.combination for combination, _ in kept)
-            if tried < 2 and len(kept) < _PAIRS and start.combination not in self.found.estimates:
+            if tried < 2 and len(kept) < most and start.combination not in self.found.estimates:
                 kept[start.combination, tried] = start
-        return list(kept.values())
 
     def _singles(self) -> list[Start]:
         """Every effect that has no place from zero, in a growing window; the others from where they promise most."""
