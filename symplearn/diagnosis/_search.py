@@ -320,12 +320,18 @@ class Search:
         return max(mine, default=-np.inf) > smaller + _WORTH
 
     def _weigh_subsets(self) -> None:
-        """What the best combinations become without each of their members, where that was not weighed yet."""
+        """What the best combinations become without each of their members, from where they are: what was weighed
+        already may have been caught in a poorer optimum, which would make the member look needed."""
         ranked = sorted((c for c in self.found.estimates if c), key=self.found.best, reverse=True)[:KEPT]
         less = dict.fromkeys(c[:k] + c[k + 1 :] for c in ranked for k in range(len(c)) if c[k] not in self.base)
-        missing = [c for c in less if c and c not in self.found.estimates]
-        if missing:
-            self.weigher.weigh([Start(c, self._shrunk(c, ranked), 0.0) for c in missing[:KEPT]], whole=True)
+        some = [c for c in less if c and (c not in self.found.estimates or self._is_behind(c, ranked))]
+        if some:
+            self.weigher.weigh([Start(c, self._shrunk(c, ranked), 0.0) for c in some[: 2 * KEPT]], whole=True)
+
+    def _is_behind(self, combination: Combination, ranked: Sequence[Combination]) -> bool:
+        """Whether one member more is worth something."""
+        larger = [self.found.best(c) for c in ranked if set(combination) < set(c)]
+        return self.found.best(combination) < max(larger)
 
     def _shrunk(self, combination: Combination, ranked: Sequence[Combination]) -> np.ndarray:
         """Where a combination begins that lacks one member of a fitted one: at that one's values."""
