@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 import integrators as ig
 
-from ._small_products import product
+from ._small_products import product, product_by_terms
 
 
 class AbstractBasis(eqx.Module):
@@ -169,7 +169,7 @@ class _PreparedPotential(ig.AbstractSeparableHamiltonian):
         return p
 
     def slope(self, q: Float[Array, "d ..."], p: Float[Array, "d ..."]) -> Float[Array, "d ..."]:
-        return product(self.weights, _products(self.of.basis, q, self.of.degree - 1))
+        return product_by_terms(self.weights, _products(self.of.basis, q, self.of.degree - 1))
 
 
 class _Prepared(ig.AbstractHamiltonian):
@@ -191,7 +191,7 @@ class _Prepared(ig.AbstractHamiltonian):
 
     def vector_field(self, x: Float[Array, "two_d ..."]) -> Float[Array, "two_d ..."]:
         """dx/dt at the phase point x, by one gradient."""
-        slope, velocity = ig.split(product(self.weights, _products(self.of.basis, x, self.of.degree - 1)))
+        slope, velocity = ig.split(product_by_terms(self.weights, _products(self.of.basis, x, self.of.degree - 1)))
         return jnp.concatenate([velocity, -slope])
 
 

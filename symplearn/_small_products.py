@@ -1,14 +1,17 @@
 """Products of small matrices, written so that XLA puts them into the loop around them.
 
-On a CPU each `@` is a call of a library, of a microsecond or so, and a loop with a call in it is not compiled as one
-function (see `_loops`). Sums of products have neither, and for the few numbers of a filter's step they are the faster
-ones by far; for large matrices the library is.
+On a CPU each `@`, and in a batch each sum along an axis, is a call of a library, of a microsecond or so, and a loop
+with a call in it is not compiled as one function (see `_loops`). For the few numbers of a filter's step sums are the
+faster way by far; for large matrices the library is.
 """
 
+import jax
 import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
-# The largest side of a matrix that is small; measured on a filter's gradient with 2 to 64 states.
+# The largest side of a matrix that is small; measured on a filter's gradient with 2 to 8 states.
 SMALL = 32
 
 
@@ -19,3 +22,49 @@ def product(left: Float[Array, "... inner"], right: Float[Array, " inner *column
     if right.ndim == 1:
         return jnp.sum(left * right, axis=-1)
     return jnp.sum(left[..., None] * right, axis=-2)
+
+
+def product_by_terms(left: Float[Array, "row inner"], right: Float[Array, " inner *column"]) -> Float[Array, "row ..."]:
+    """left @ right without a sum along an axis, which in a batch of many is a call of a library again.
+
+    For few terms in an innermost loop. In the filter's step, where others take the result, it is slower.
+    """
+    if max(left.shape + right.shape) > SMALL:
+        return left @ right
+    dtype, columns = jnp.result_type(left, right), right.reshape(right.shape[0], -1)
+    return _product.bind(left.astype(dtype), columns.astype(dtype)).reshape(left.shape[0], *right.shape[1:])
+
+
+def _term_by_term(left, right):
+    """Of matrices, or of as many on either side."""
+    total = left[..., :, :1] * right[..., :1, :]
+    for k in range(1, left.shape[-1]):
+        total = total + left[..., :, k : k + 1] * right[..., k : k + 1, :]
+    return total
+
+
+def _transposed(matrix):
+    return jnp.swapaxes(matrix, -1, -2)
+
+
+def _batched(arguments, axes):
+    """Batch axes first, on both sides."""
+    size = next(one.shape[axis] for one, axis in zip(arguments, axes, strict=True) if axis is not None)
+    pairs = zip(arguments, axes, strict=True)
+    both = [
+        jnp.broadcast_to(one, (size, *one.shape)) if axis is None else jnp.moveaxis(one, axis, 0) for one, axis in pairs
+    ]
+    return _product.bind(*both), 0
+
+
+# A primitive, because JAX's own derivative of a product written term by term is a sum along axes.
+_product = Primitive("small_product")
+_product.def_impl(jax.jit(_term_by_term))
+_product.def_abstract_eval(lambda left, right: jax.core.ShapedArray((*left.shape[:-1], right.shape[-1]), left.dtype))
+mlir.register_lowering(_product, mlir.lower_fun(_term_by_term, multiple_results=False))
+ad.defbilinear(
+    _product,
+    lambda cotangent, left, right: _product.bind(cotangent, _transposed(right)),
+    lambda cotangent, left, right: _product.bind(_transposed(left), cotangent),
+)
+batching.primitive_batchers[_product] = _batched

@@ -11,7 +11,7 @@ from integrators.problems import HarmonicOscillator, HenonHeiles
 from symplearn import _filter
 from symplearn._log_posterior import guarded
 from symplearn._model import intervals_between
-from symplearn._small_products import SMALL, product
+from symplearn._small_products import SMALL, product, product_by_terms
 
 
 def assert_same_in_value_and_derivatives(fast, plain, at):
@@ -30,6 +30,22 @@ def test_a_small_product_is_the_product(left, right):
     assert_same_in_value_and_derivatives(
         lambda x: product(x, right), lambda x: x @ right, jnp.asarray(random.normal(size=left))
     )
+
+
+@pytest.mark.parametrize("right", [(3,), (3, 4)])
+def test_a_product_by_terms_is_the_product(right):
+    """Alone and in a batch, of one side or of both, in forward and in reverse mode, by both sides."""
+    random = np.random.default_rng(0)
+    left, right = jnp.asarray(random.normal(size=(5, 2, 3))), jnp.asarray(random.normal(size=(5, *right)))
+    for fast, plain in (
+        (lambda x: product_by_terms(x[0], right[0]), lambda x: x[0] @ right[0]),
+        (lambda x: jax.vmap(product_by_terms)(x, right), lambda x: jax.vmap(jnp.matmul)(x, right)),
+        (lambda x: jax.vmap(product_by_terms, (0, None))(x, right[1]), lambda x: x @ right[1]),
+    ):
+        assert_same_in_value_and_derivatives(fast, plain, left)
+        np.testing.assert_allclose(jax.jacfwd(fast)(left), jax.jacfwd(plain)(left), rtol=1e-12, atol=1e-12)
+    by_right = (jax.jacrev(jax.vmap(f, (None, 0)), 1)(left[0], right) for f in (product_by_terms, jnp.matmul))
+    np.testing.assert_allclose(*by_right, rtol=1e-12, atol=1e-12)
 
 
 class Driven(ig.AbstractSeparableHamiltonian):
