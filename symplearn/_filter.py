@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from ._errors import InputError
 from ._faults import IMPOSSIBLE, SENTENCES, Fault, first_fault, is_fatal, is_remote
 from ._guard import guard
-from ._model import AbstractAffine, AbstractStateSpaceModel, StateSpaceModel
+from ._model import AbstractAffine, AbstractStateSpaceModel, StateSpaceModel, slice_at
 from ._small_products import product
 from ._transforms import STANDARD, AbstractTransform, Moments, Taylor
 from ._triangular import forward_substitution, triangularise
@@ -100,7 +100,8 @@ def unscented_filter(
 
     Works under `jit`, `vmap`, `jacfwd` and `grad`. A failure is a value: see `Filtered.fault`; derivatives are then 0.
     """
-    carry, history = _run(model, readings, intervals, contexts, transform, keep=True)
+    carry, first, later = _run(model, readings, intervals, contexts, transform, keep=True)
+    history = [jnp.concatenate([one[None], rest]) for one, rest in zip(first, later, strict=True)]
     # The fields of `_Record` are those of `Filtered` between the first and the faults.
     return Filtered(*(carry.log_likelihood, *history, carry.fault, carry.fault_step))
 
@@ -142,36 +143,37 @@ def _run(model, readings, intervals, contexts, transform, keep):
     model = guard(model)
     mean, root = jnp.asarray(model.initial.mean), model.initial.root
     none = jnp.asarray(int(Fault.NONE))
-    carry = _Carry(mean, root, jnp.zeros((), mean.dtype), none, jnp.asarray(-1))
+    start = _Carry(mean, root, jnp.zeros((), mean.dtype), none, jnp.asarray(-1))
+    predicted = Moments(mean, root, jnp.zeros((mean.shape[0], 0)))
+    carry, first = _measure(model, transform, start, predicted, readings[0], slice_at(contexts, 0), 0)
 
     def step(carry, data):
         reading, interval, context, k = data
         inside, carry = guard((model, carry))
         predicted = inside.predict(transform, carry.mean, carry.root, interval)
-        carry, record = _measure(inside, transform, carry, _prior(carry, predicted, k), reading, context, k)
+        carry, record = _measure(inside, transform, carry, predicted, reading, context, k)
         return carry, (record if keep else None)
 
     # Checkpointing the step makes the gradient faster as well as 16 times smaller (performance.md, A7).
     step = jax.checkpoint(step, prevent_cse=False)
     if keep or len(readings) * sum(leaf.nbytes for leaf in carry) <= _KEPT:
-        # The first reading is of the loop too, where a prediction is computed in vain: outside it would take as long as
-        # twenty readings inside, since only loops are compiled as one function.
-        intervals = jax.tree.map(_repeated_first, intervals)
-        carry, history = jax.lax.scan(step, carry, (readings, intervals, contexts, np.arange(len(readings))))
+        later_contexts = jax.tree.map(lambda leaf: leaf[1:], contexts)
+        data = readings[1:], intervals, later_contexts, np.arange(1, len(readings))
+        carry, later = jax.lax.scan(step, carry, data)
     else:
-        carry, history = _in_stretches(step, carry, (readings, contexts), intervals), None
+        carry, later = _in_stretches(step, carry, (readings, contexts), intervals), None
     # What a last step leaves in the tangents is past every guard inside.
-    return carry._replace(log_likelihood=guard(carry.log_likelihood)), history
+    return carry._replace(log_likelihood=guard(carry.log_likelihood)), first, later
 
 
 def _in_stretches(step, carry, of_readings, intervals):
-    """The carry after all readings, whose derivative keeps only that at the start of every stretch of sqrt(n).
+    """The carry after all readings; derivatives keep only that at the start of every stretch of sqrt(n) readings.
 
     Each stretch is taken out of the recording when its turn comes: a copy of all of it would be larger than what is
     saved. The last one may be longer than what is left, and does nothing there.
     """
     count = len(of_readings[0])
-    length = math.isqrt(count - 1) + 1
+    length = math.isqrt(count) + 1
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def stretch(carry, begin):
@@ -184,20 +186,7 @@ def _in_stretches(step, carry, of_readings, intervals):
         after, _ = step(carry, data)
         return jax.tree.map(lambda new, old: jnp.where(data[-1] < count, new, old), after, carry), None
 
-    return jax.lax.scan(stretch, carry, np.arange(0, count, length))[0]
-
-
-def _repeated_first(leaf: Array) -> Array:
-    """One more entry, before the others; zeros where there are none."""
-    return jnp.concatenate([leaf[:1] if len(leaf) else jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), leaf])
-
-
-def _prior(carry: _Carry, predicted: Moments, k: Array) -> Moments:
-    """What is known before reading k: the prediction, and at k = 0 the initial distribution."""
-    width = max(predicted.factor.shape[1], carry.root.shape[1])
-    factor, root = (jnp.pad(one, ((0, 0), (0, width - one.shape[1]))) for one in (predicted.factor, carry.root))
-    mean = jnp.where(k > 0, predicted.mean, carry.mean)
-    return predicted._replace(mean=mean, factor=jnp.where(k > 0, factor, root))
+    return jax.lax.scan(stretch, carry, np.arange(1, count, length))[0]
 
 
 def _measure(model, transform, carry, predicted, reading, context, k):
