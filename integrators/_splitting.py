@@ -36,7 +36,8 @@ class AbstractVerlet(AbstractIntegrator):
 class Leapfrog(AbstractVerlet):
     """Leapfrog, or Stormer-Verlet, for H = T(p) + U(q): kick, drift, kick. Dissertation (5.5)-(5.6).
 
-    The first choice for a separable system. Order 2, symplectic, symmetric; two evaluations of dU/dq a step.
+    The first choice for a separable system. Order 2, symplectic, symmetric; two evaluations of dU/dq a
+    step, and one where steps without forces follow each other.
     """
 
     def flow(
@@ -74,7 +75,8 @@ class Leapfrog(AbstractVerlet):
 class PositionVerlet(AbstractVerlet):
     """Leapfrog with the drift outside, for H = T(p) + U(q): drift, kick, drift. Tuckerman, Berne & Martyna (1992).
 
-    Order 2, symplectic, symmetric; one evaluation of dU/dq a step, where `Leapfrog` has two, and two of dT/dp.
+    Order 2, symplectic, symmetric; one evaluation of dU/dq a step, where a single step of `Leapfrog` has two, and
+    two of dT/dp.
     """
 
     def flow(
