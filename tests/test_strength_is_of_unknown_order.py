@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from symplearn.diagnosis._strength import WIDTHS, mixture_gain, turning_gain
+from symplearn.diagnosis._strength import FAINT, FAINT_WIDTHS, WIDTHS, mixture_gain, turning_gain
 
 NONE = -np.inf
 
@@ -36,6 +36,23 @@ def test_one_amplitude_is_integrated_as_quadrature_does(sd, told, lowest):
     gain = mixture_gain(centre, spread, np.zeros(1, int), np.array([lowest]))
     expected = np.log(np.mean([evidence(w) for w in widths]) / evidence(1.0))
     assert gain == pytest.approx(expected, abs=1e-7)  # quadrature's own 1.5e-8, relative, of either integral
+
+
+def test_alone_an_effect_may_be_too_weak_to_be_seen():
+    """Widths go down to the same share of the widest whatever the recording shows: of a poor recording most of them are
+    too narrow to be told from nothing, of a good one few, and so much of nothing's evidence an absent effect keeps."""
+    for sd, least, most in ((0.1, 0.7, 0.9), (1e-5, 0.0, 0.1)):
+        centre, spread = posterior(np.array([0.0]), np.array([[sd**2]]))
+        gain = mixture_gain(centre, spread, np.zeros(1, int), np.full(1, NONE), alone=True)
+        widths = np.geomspace(FAINT, 1.0, FAINT_WIDTHS)
+        expected = np.mean(stats.norm.pdf(0.0, scale=np.hypot(widths, sd))) / stats.norm.pdf(
+            0.0, scale=np.hypot(1.0, sd)
+        )
+        assert gain == pytest.approx(
+            np.log(expected), abs=1e-9
+        )  # round-off, of a likelihood 1e5 narrower than the prior
+        nothing = stats.norm.pdf(0.0, scale=sd) / stats.norm.pdf(0.0, scale=np.hypot(1.0, sd))
+        assert least < np.exp(gain) / nothing < most
 
 
 def test_two_effects_have_a_width_each():

@@ -1,9 +1,12 @@
-"""How strong an effect is: of unknown order of magnitude, from what the recording can just show to as strong as the
-forces that are already there.
+"""How strong an effect is: of unknown order of magnitude.
 
 A Gaussian prior as wide as the strongest effect makes a small one pay for every order of magnitude that it is smaller,
 and effects of different units pay differently for the same thing. So each effect's prior is a mixture of Gaussians
 whose widths are spread evenly in their logarithm. Fits are made under the widest; the others follow from its posterior.
+
+One effect alone may be too weak for the recording to show: so much is left of its prior where nothing is seen, and the
+simulation as it is is as much less certain. Of several each is one that the recording can show; with a weaker one among
+them they are the smaller combination.
 """
 
 import itertools
@@ -18,9 +21,11 @@ from ._calibrate import Priors
 from ._evidence import orthants
 from ._problem import Combination, Problem
 
-# Widths of the mixture, and the narrowest of them in standard deviations of the estimate: an effect that no recording
-# of this kind could show is not what is asked for.
+# Widths of the mixture, and the narrowest of them in standard deviations of the estimate.
 WIDTHS, _SEEN = 7, 4.0
+# The widths of an effect alone, and the narrowest of them in that of the widest: as the weakest missing force is to the
+# strongest that are tried.
+FAINT_WIDTHS, FAINT = 13, 1e-4
 # Standard deviation of the logarithm of where a self-excitation turns into a damping, about the size of the motion.
 _TURNING = np.log(2.0)
 # The grid that integrates over it, in standard deviations of the estimate.
@@ -35,11 +40,12 @@ def strength_gain(
 ) -> float:  # fmt: skip
     """Log evidence under unknown orders of magnitude, less that under the widest priors, whose posterior is given."""
     total, blocks = 0.0, []
+    alone = sum(problem.candidate(member).effect.amplitudes > 0 for member in combination) == 1
     for member in combination:
         entries = _entries(problem, combination, member)
         if problem.candidate(member).effect is EXCITATION:
             total += turning_gain(
-                z[entries], covariance[np.ix_(entries, entries)], priors.scales[problem.candidate(member).values]
+                z[entries], covariance[np.ix_(entries, entries)], priors.scales[problem.candidate(member).values], alone
             )
         elif len(entries):
             blocks.append(entries)
@@ -51,15 +57,15 @@ def strength_gain(
     spread = covariance[np.ix_(a, a)] / np.outer(unit, unit)
     bounds = problem.lower_bounds(combination)
     lowest = np.array([bounds.get(int(k), -np.inf) for k in a]) / unit
-    return total + mixture_gain(centre, spread, own, lowest)
+    return total + mixture_gain(centre, spread, own, lowest, alone)
 
 
-def turning_gain(centre: np.ndarray, spread: np.ndarray, scales: np.ndarray) -> float:
+def turning_gain(centre: np.ndarray, spread: np.ndarray, scales: np.ndarray, alone: bool = False) -> float:
     """The same for a self-excitation c (1 - q^2/a^2) v, inside c v - e q^2 v, whose a is about where the motion is.
 
     Of c and e each for itself, most would be dampings that grow with q^2 and drive nothing.
     """
-    size = np.geomspace(max(min(_SEEN * np.sqrt(spread[0, 0]) / scales[0], 1.0), 1e-12), 1.0, WIDTHS)
+    size = _widths(_SEEN * np.sqrt(spread[0, 0]) / scales[0], alone)
     root = np.linalg.cholesky(spread + np.diag(1e-12 * np.diag(spread) + 1e-300))
     grid = np.linspace(-_REACH, _REACH, _POINTS)
     normal = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
@@ -72,7 +78,7 @@ def turning_gain(centre: np.ndarray, spread: np.ndarray, scales: np.ndarray) -> 
     a = np.sqrt(c / e)
     # Density of e given c: that of ln a, by |d ln a / d e| = 1 / (2 e).
     turning = norm.logpdf(np.log(a), 0.5 * np.log(scales[0] / scales[1]), _TURNING) - np.log(2 * e)
-    strength = logsumexp(norm.logpdf(c[:, None], scale=size * scales[0]), axis=1) - np.log(WIDTHS)
+    strength = logsumexp(norm.logpdf(c[:, None], scale=size * scales[0]), axis=1) - np.log(len(size))
     wide = norm.logpdf(c, scale=scales[0]) + norm.logpdf(e, scale=scales[1]) + np.log(2.0)
     return float(logsumexp(mass + turning + strength - wide) - logsumexp(mass))
 
@@ -86,11 +92,13 @@ def _entries(problem: Problem, combination: Combination, member: int) -> np.ndar
 
 
 def mixture_gain(
-    centre: Float[np.ndarray, " a"], spread: Float[np.ndarray, "a a"], own: np.ndarray, lowest: Float[np.ndarray, " a"]
-) -> float:
+    centre: Float[np.ndarray, " a"], spread: Float[np.ndarray, "a a"], own: np.ndarray, lowest: Float[np.ndarray, " a"],
+    alone: bool = False,
+) -> float:  # fmt: skip
     """The same for a posterior in units of the widest priors, all of them about zero and of sd one.
 
-    **Arguments:** - `own`: the number of the effect that each entry belongs to. - `lowest`: bounds of the entries.
+    **Arguments:** - `own`: the number of the effect that each entry belongs to. - `lowest`: bounds of the entries. -
+    `alone`: whether an effect too weak to be seen counts.
     """
     if not (np.isfinite(centre).all() and np.isfinite(spread).all()):
         return 0.0
@@ -98,19 +106,24 @@ def mixture_gain(
     left = np.maximum(1.0 - values, _SILENT)  # what the recording says, as a share of all that is known
     likelihood = (vectors * (np.maximum(values, 1e-300) / left)) @ vectors.T  # covariance without the priors
     told = vectors @ ((vectors.T @ centre) / left)
-    shares = [_shares(spread[np.ix_(own == k, own == k)]) for k in range(own[-1] + 1)]
+    shares = [_shares(spread[np.ix_(own == k, own == k)], alone) for k in range(own[-1] + 1)]
     widths = np.array(list(itertools.product(*shares)))[:, own]
     widest = np.ones((1, len(own)))
     weigh = lambda w: _log_weights(told, likelihood, w, lowest)  # noqa: E731
     return float(logsumexp(weigh(widths)) - np.log(len(widths)) - weigh(widest)[0])
 
 
-def _shares(spread: Float[np.ndarray, "b b"]) -> np.ndarray:
+def _shares(spread: Float[np.ndarray, "b b"], alone: bool) -> np.ndarray:
     """Widths of one effect's prior, in that of the widest."""
     values = np.clip(np.linalg.eigvalsh(spread), 1e-300, None)
     information = float(np.mean(np.maximum(1.0 / values - 1.0, 0.0)))
-    narrowest = _SEEN / np.sqrt(max(information, 1e-300))
-    return np.geomspace(narrowest, 1.0, WIDTHS) if narrowest < 1.0 else np.ones(1)
+    return _widths(_SEEN / np.sqrt(max(information, 1e-300)), alone)
+
+
+def _widths(narrowest: float, alone: bool) -> np.ndarray:
+    if alone:
+        return np.geomspace(FAINT, 1.0, FAINT_WIDTHS)
+    return np.geomspace(max(narrowest, 1e-12), 1.0, WIDTHS) if narrowest < 1.0 else np.ones(1)
 
 
 def _log_weights(told: np.ndarray, likelihood: np.ndarray, widths: np.ndarray, lowest: np.ndarray) -> np.ndarray:
