@@ -31,20 +31,27 @@ def negative_log_posterior(
 
 
 def gradient(score: Callable[[Array], Array], size: int) -> Callable[[Array], Array]:
-    """The gradient of a score of `size` parameters: forward for one, reverse for more."""
-    return jax.jacfwd(score) if size <= _FORWARD else jax.grad(score)
+    """The gradient of a score of `size` parameters: forward for one, reverse for more, if it has a reverse."""
+    return lambda free: _value_and_gradient(score, size)(free)[1]
 
 
 def _value_and_gradient(score: Callable[[Array], Array], size: int) -> Callable[[Array], tuple[Array, Array]]:
     """A score and its gradient, as `gradient` has it."""
-    if size > _FORWARD:
-        return jax.value_and_grad(score)
 
-    def both(free):
+    def forward(free):
         slope, value = jax.jacfwd(lambda x: (score(x),) * 2, has_aux=True)(free)
         return value, slope
 
-    return both
+    def reverse(free):
+        try:
+            return jax.value_and_grad(score)(free)
+        except ValueError as error:
+            # A propagator with a loop of traced length has none.
+            if "Reverse-mode differentiation" not in str(error):
+                raise
+            return forward(free)
+
+    return forward if size <= _FORWARD else reverse
 
 
 def guarded(score: Callable[[Array], Array], size: int) -> Callable[[Array], Array]:

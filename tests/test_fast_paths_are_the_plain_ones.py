@@ -9,7 +9,7 @@ import integrators as ig
 import symplearn as sl
 from integrators.problems import HarmonicOscillator, HenonHeiles
 from symplearn import _filter
-from symplearn._log_posterior import guarded
+from symplearn._log_posterior import gradient, guarded
 from symplearn._model import intervals_between
 from symplearn._small_products import SMALL, product, product_by_terms
 
@@ -163,3 +163,23 @@ def test_forward_and_reverse_mode_agree():
     for size in (1, 2, 13):
         at = jnp.linspace(0.1, 1.0, size)
         np.testing.assert_allclose(jax.grad(guarded(score, size))(at), jax.grad(score)(at), rtol=1e-12)
+
+
+def test_a_score_without_a_reverse_has_its_forward_slope():
+    """A loop of traced length, which JAX cannot take backwards, is differentiated forwards however many parameters."""
+
+    def score(x):
+        turns = jnp.asarray(3 + x.size)
+        return jax.lax.fori_loop(0, turns, lambda _, total: total + jnp.sum(jnp.sin(x * total)), jnp.ones(()))
+
+    def unrolled(x):
+        total = jnp.ones(())
+        for _ in range(3 + x.size):
+            total = total + jnp.sum(jnp.sin(x * total))
+        return total
+
+    x = jnp.array([0.1, -0.2, 0.4])
+    value, slope = jax.value_and_grad(guarded(score, x.size))(x)
+    np.testing.assert_allclose(value, unrolled(x), rtol=1e-12)  # round-off
+    np.testing.assert_allclose(slope, jax.grad(unrolled)(x), rtol=1e-12)  # round-off
+    np.testing.assert_allclose(jax.jit(gradient(score, x.size))(x), slope, rtol=1e-12)  # round-off
