@@ -32,6 +32,8 @@ _TURNING = np.log(2.0)
 _REACH, _POINTS = 5.0, 121
 # What the recording says of a direction is at least this share of what the prior says.
 _SILENT = 1e-9
+# Of a correlation matrix.
+_ROUND_OFF = 1e-13
 
 
 def strength_gain(
@@ -100,7 +102,7 @@ def mixture_gain(
     **Arguments:** - `own`: the number of the effect that each entry belongs to. - `lowest`: bounds of the entries. -
     `alone`: whether an effect too weak to be seen counts.
     """
-    if not (np.isfinite(centre).all() and np.isfinite(spread).all()):
+    if not (np.isfinite(centre).all() and np.isfinite(spread).all() and (np.diag(spread) > 0).all()):
         return 0.0
     values, vectors = np.linalg.eigh(spread)
     left = np.maximum(1.0 - values, _SILENT)  # what the recording says, as a share of all that is known
@@ -130,9 +132,12 @@ def _log_weights(told: np.ndarray, likelihood: np.ndarray, widths: np.ndarray, l
     """Log evidence of every choice of widths, up to one constant."""
     prior = widths**2
     total = likelihood + prior[:, :, None] * np.eye(len(told))
-    inverse = np.linalg.inv(total)
+    scale = np.sqrt(total[:, np.arange(len(told)), np.arange(len(told))])
+    scales = scale[:, :, None] * scale[:, None, :]
+    correlation = total / scales + _ROUND_OFF * np.eye(len(told))  # which two like unknowns may leave singular
+    inverse = np.linalg.inv(correlation) / scales
     solved = inverse @ told
-    out = -0.5 * solved @ told - 0.5 * np.linalg.slogdet(total)[1]
+    out = -0.5 * solved @ told - 0.5 * np.linalg.slogdet(correlation)[1] - np.log(scale).sum(1)
     some = np.isfinite(lowest)
     if some.any():
         centre = (prior * solved)[:, some] - lowest[some]
