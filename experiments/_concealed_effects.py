@@ -80,10 +80,10 @@ class Inputs:
     values: np.ndarray
     linear: bool = False
 
-    def at(self, t: float, since: float) -> float:
-        """Its value at t within the interval between rows that holds `since`."""
+    def at(self, t: Any, since: float) -> Any:
+        """Its value at t, or at as many times, within the interval between rows that holds `since`."""
         if self.linear:
-            return float(np.interp(t, self.times, self.values))
+            return np.interp(t, self.times, self.values)
         place = np.searchsorted(self.times, since, side="right") - 1
         return float(self.values[max(int(place), 0)])
 

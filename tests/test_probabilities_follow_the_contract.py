@@ -170,9 +170,19 @@ def test_probabilities_add_to_one_and_come_likeliest_first(problem):
     fits = [estimate(problem, c, 4 * rng.normal(), kind) for c in everything for kind in ("white", "coloured", "force")]
     p = posterior(problem, found(problem, *fits), 1.0)
     named = [w.probability for w in p.named]
-    assert p.as_it_is + p.unexplained + sum(named) == pytest.approx(1.0, rel=ROUND_OFF)
+    assert p.as_it_is + p.unexplained + p.faint + sum(named) == pytest.approx(1.0, rel=ROUND_OFF)
     n = len(problem.searched)
     assert named == sorted(named, reverse=True) and len(named) == n + n * (n - 1) // 2
+
+
+def test_what_was_not_fitted_may_be_too_weak_to_be_seen(problem):
+    """Effects without a fit keep their price as far as four standard errors lie above 1e-4 of the largest."""
+    one = (place(problem, "viscous_damping", "q1"),)
+    p = posterior(problem, found(problem, estimate(problem, (), 0.0), estimate(problem, one, -2.0, sd=0.01)), 1.0)
+    rest = 1 - 1 / FAMILIES - DAMPING
+    assert p.faint / p.as_it_is == pytest.approx(rest * np.log10(4 * 0.01 / 1e-4) / 4, rel=1e-9)
+    everything = [estimate(problem, c, 0.0) for c in singles(problem)]
+    assert posterior(problem, found(problem, estimate(problem, (), 0.0), *everything), 1.0).faint == 0.0
 
 
 def test_a_combination_pays_every_members_price(problem):
@@ -204,7 +214,7 @@ def test_what_the_recording_says_nothing_of_is_not_weighed(problem):
     wide[slot, slot] = 0.9
     p = posterior(problem, found(problem, *fits, replace(both, covariance=wide)), 1.0)
     assert [w.combination for w in p.named] == [(known,)]
-    assert p.as_it_is + p.unexplained + p.named[0].probability == pytest.approx(1.0, rel=ROUND_OFF)
+    assert p.as_it_is + p.unexplained + p.faint + p.named[0].probability == pytest.approx(1.0, rel=ROUND_OFF)
 
 
 def test_how_wide_is_measured_in_each_effects_own_prior(problem):
@@ -234,7 +244,7 @@ def test_a_fit_that_failed_has_no_probability(problem):
     fits = [estimate(problem, (), 0.0), estimate(problem, one, -np.inf), estimate(problem, other, 1.0)]
     p = posterior(problem, found(problem, *fits), 1.0)
     assert [w.combination for w in p.named] == [other]
-    assert p.unexplained == 0.0 and p.as_it_is + p.named[0].probability == pytest.approx(1.0)
+    assert p.unexplained == 0.0 and p.as_it_is + p.faint + p.named[0].probability == pytest.approx(1.0)
 
 
 def test_of_two_estimates_of_one_kind_the_better_counts(problem):

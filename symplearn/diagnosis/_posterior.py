@@ -8,6 +8,7 @@ import numpy as np
 from .._effects import IMPULSE, prices
 from ._found import Found
 from ._problem import Combination, Problem
+from ._strength import faint_share
 from ._weighed import Estimate
 
 # A coefficient whose posterior is as wide as this share of its prior has learnt nothing from the recording.
@@ -37,13 +38,15 @@ class Posterior:
     """Probabilities of everything that was weighed.
 
     `as_it_is` is the probability of the simulation with nothing left out, `unexplained` that of a remainder without
-    a name; `named` holds the combinations, likeliest first. They add up to one. `tempered` is the factor by which log
-    evidences were shrunk because the remainder is not white on the scale of the motion.
+    a name; `named` holds the combinations, likeliest first; `faint` that of a single effect that was not fitted because
+    the recording shows nothing of it. They add up to one. `tempered` is the factor by which log evidences were shrunk
+    because the remainder is not white on the scale of the motion.
     """
 
     as_it_is: float
     unexplained: float
     named: tuple[Weighed, ...]
+    faint: float
     nothing: Estimate  # the best estimate without effects
     evidences: dict[Combination, float]  # tempered log evidence of everything fitted, nothing (best kind) included
     tempered: float
@@ -61,7 +64,7 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     factor = 1.0 / max(1.0, inflation)
     top = max(e.log_evidence for es in found.estimates.values() for e in es)
     if not np.isfinite(top):
-        return Posterior(0.0, 1.0, (), _speaker(found.estimates[()]), {(): -np.inf}, factor)
+        return Posterior(0.0, 1.0, (), 0.0, _speaker(found.estimates[()]), {(): -np.inf}, factor)
     white, other, named = -np.inf, -np.inf, []
     evidences: dict[Combination, float] = {}
     for combination, estimates in found.estimates.items():
@@ -75,18 +78,43 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
         elif any(e.converged for e in estimates) and _informed(problem, found, combination):
             weight = float(np.log([price[c] for c in combination]).sum())
             named.append((combination, weight, total, _speaker(estimates)))
-    logs = np.array([white, np.log(remainder) + other, *(w + total for _, w, total, _ in named)])
+    with np.errstate(divide="ignore"):
+        faint = white + np.log(_unseen(problem, found, whole))
+    logs = np.array([white, np.log(remainder) + other, faint, *(w + total for _, w, total, _ in named)])
     probability = np.exp(logs - logs.max())
     probability /= probability.sum()
-    ranked = sorted(zip(named, probability[2:], strict=True), key=lambda pair: -pair[1])
+    ranked = sorted(zip(named, probability[3:], strict=True), key=lambda pair: -pair[1])
     return Posterior(
         as_it_is=float(probability[0]),
         unexplained=float(probability[1]),
         named=tuple(Weighed(c, float(p), float(total), best) for (c, _, total, best), p in ranked),
+        faint=float(probability[2]),
         nothing=_speaker(found.estimates[()]),
         evidences=evidences,
         tempered=factor,
     )
+
+
+def _unseen(problem: Problem, found: Found, price: dict[int, float]) -> float:
+    """Prior of the effects that were not fitted, as far as they are too weak to be seen: on average as those that were.
+
+    Where the simulation nearly follows the recording only those of the highest scores are fitted.
+    """
+    alone = [c for c in found.estimates if len(c) == 1]
+    shares = [share for c in alone if (share := _faint(problem, found, c)) is not None]
+    fitted = {problem.whole(m) for (m,) in alone}
+    return sum(p for m, p in price.items() if m not in fitted) * float(np.mean(shares)) if shares else 0.0
+
+
+def _faint(problem: Problem, found: Found, combination: Combination) -> float | None:
+    """Share of the prior of an effect alone that the recording could not show; None where it says nothing of it."""
+    ((member, place),) = problem.placed(combination)
+    one = problem.candidate(member)
+    if not one.effect.amplitudes:
+        return None
+    best = max(found.estimates[combination], key=lambda e: e.log_evidence)
+    sd = float(np.sqrt(best.covariance[place.start, place.start]) / found.priors.scales[one.first])
+    return faint_share(sd) if sd < _UNINFORMED else None
 
 
 def _speaker(estimates: Sequence[Estimate]) -> Estimate:

@@ -122,6 +122,11 @@ def _shares(spread: Float[np.ndarray, "b b"], alone: bool) -> np.ndarray:
     return _widths(_SEEN / np.sqrt(max(information, 1e-300)), alone)
 
 
+def faint_share(sd: float) -> float:
+    """Share of the prior of an effect alone that an estimate with this error, in units of the widest, does not show."""
+    return float(np.clip(np.log(_SEEN * max(sd, 1e-300) / FAINT) / -np.log(FAINT), 0.0, 1.0))
+
+
 def _widths(narrowest: float, alone: bool) -> np.ndarray:
     if alone:
         return np.geomspace(FAINT, 1.0, FAINT_WIDTHS)
