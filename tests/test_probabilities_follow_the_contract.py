@@ -9,6 +9,7 @@ import pytest
 
 from symplearn._effects import prices, vocabulary
 from symplearn.diagnosis._calibrate import Priors
+from symplearn.diagnosis._document import told_apart
 from symplearn.diagnosis._found import Found
 from symplearn.diagnosis._posterior import posterior
 from symplearn.diagnosis._weighed import Estimate
@@ -141,6 +142,23 @@ def test_members_in_some_recordings_share_what_their_target_has(recordings):
     subsets = {problem.members[m].recordings for m in members}
     # All, each one alone, and all but one.
     assert len(subsets) == {1: 1, 2: 3, 3: 7}[recordings]
+
+
+def test_choices_of_recordings_and_sides_stand_together():
+    """Of one effect and target the answer tells one line, with the probability of all its choices together."""
+    problem = made(2)
+    drag, stop = place(problem, "viscous_damping", "q1"), place(problem, "contact_stop", "q2")
+    (other,) = [m for m in problem.searched if problem.candidate(m).key == problem.candidate(stop).key and m != stop]
+    members = [drag, *problem.variants(drag), stop, other]
+    fits = [estimate(problem, (), 0.0), *(estimate(problem, (m,), float(k)) for k, m in enumerate(members))]
+    named = posterior(problem, found(problem, *fits), 1.0).named
+    told = told_apart(problem, named)
+    assert len(named) == 5 and len(told) == 2
+    for one, choices in zip(sorted(told, key=lambda w: w.combination[0] == stop or w.combination[0] == other),
+                            (members[:3], members[3:]), strict=True):  # fmt: skip
+        mine = [w for w in named if w.combination[0] in choices]
+        assert one.probability == pytest.approx(sum(w.probability for w in mine), rel=ROUND_OFF)
+        assert one.combination == max(mine, key=lambda w: w.probability).combination
 
 
 def test_a_narrower_search_shares_among_what_is_left():

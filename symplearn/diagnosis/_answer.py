@@ -78,9 +78,10 @@ class Answer:
         p = self.posterior
         if p.as_it_is >= CONSISTENT:
             return None, "consistent"
-        if not p.named or p.unexplained > p.named[0].probability:
+        ranked = document.told_apart(self.problem, p.named)
+        if not ranked or p.unexplained > ranked[0].probability:
             return None, "unexplained"
-        return p.named[0], "mismatch"
+        return ranked[0], "mismatch"
 
     def _outlooks(self, estimate: Estimate, intensity: np.ndarray) -> list[Outlook]:
         return [Outlook(self.stepper, estimate, r, intensity) for r in range(len(self.problem.rows))]

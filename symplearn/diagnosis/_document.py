@@ -1,6 +1,7 @@
 """The answer as the contract words it: diagnosis.json (section 4) as plain data."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -60,11 +61,22 @@ def finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
+def told_apart(problem: Problem, named: Sequence[Weighed]) -> list[Weighed]:
+    """One for every set of effects and targets, likeliest first: with the probability of all choices of recordings and
+    sides together, of which the likeliest speaks for it."""
+    groups: dict[tuple[Any, ...], Weighed] = {}
+    for w in named:
+        keys = tuple(sorted(problem.candidate(m).key for m in w.combination))
+        first = groups.get(keys)
+        groups[keys] = replace(first, probability=first.probability + w.probability) if first else w
+    return sorted(groups.values(), key=lambda w: -w.probability)
+
+
 def alternatives(
     problem: Problem, posterior: Posterior, verdict: str, chosen: Weighed | None
 ) -> tuple[list[Any], float]:
     """Everything weighed beside the reported combination, likeliest first, and what is left over."""
-    rows = [_alternative(problem, w.combination, False, w.probability) for w in posterior.named
+    rows = [_alternative(problem, w.combination, False, w.probability) for w in told_apart(problem, posterior.named)
             if chosen is None or w.combination != chosen.combination]  # fmt: skip
     rows = [row for row in rows if row["probability"] > _LEAST][:_LISTED]
     if verdict != "unexplained":
