@@ -161,3 +161,11 @@ def test_scores_that_are_all_zero_do_not_count():
     assert variance_inflation(padded) == variance_inflation(scores) > 10
     assert variance_inflation(np.zeros((1200, 2))) == 1.0
     assert variance_inflation(scores[:40]) == 1.0
+
+
+def test_what_ran_away_has_no_evidence():
+    """Slopes that overflowed make a combination impossible, not the search fail."""
+    gram = np.eye(4)
+    gram[1, 2] = gram[2, 1] = np.inf
+    found = laplace(gram, 0.0, np.zeros(3), np.zeros(3), np.ones(3), np.ones(3, bool), {})
+    assert found.log_evidence == -np.inf and not found.covariance.any() and not found.step.any()

@@ -44,6 +44,8 @@ def laplace(
     diagonal = np.diag(matrix)
     scale = np.sqrt(np.where(diagonal > _TINY, diagonal, 1.0))
     scaled = matrix / np.outer(scale, scale)
+    if not np.isfinite(scaled).all():  # a trajectory that ran away
+        return Laplace(-np.inf, np.zeros(len(z)), np.zeros((len(z), len(z))), 0.0)
     values, vectors = np.linalg.eigh(scaled)
     values = np.maximum(values, 1e-13)  # a direction that neither data nor prior hold keeps a wide, finite spread
     inverse = (vectors / values) @ vectors.T / np.outer(scale, scale)
