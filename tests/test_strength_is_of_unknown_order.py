@@ -135,3 +135,12 @@ def test_a_self_excitation_turns_where_the_motion_is(told):
     expected = np.log(integral(turning, np.log(1e-4), np.log(0.4)) / integral(independent, np.log(1e-7), np.log(0.4)))
     # The grid of the gain is a twelfth of a standard deviation wide and the density has an edge at c = 0.
     assert turning_gain(centre, spread, scales) == pytest.approx(expected, abs=0.05)
+
+
+def test_what_is_not_known_to_be_a_spread_gains_nothing():
+    """Posteriors of failed fits, singular ones, and ones that round-off left indefinite give numbers and no error."""
+    scales, nothing = np.array([0.3, 0.5]), np.full(2, NONE)
+    for spread in (np.zeros((2, 2)), np.full((2, 2), np.nan), np.array([[1.0, 1 + 1e-12], [1 + 1e-12, 1.0]]) * 1e-4):
+        for alone in (False, True):
+            assert np.isfinite(turning_gain(np.array([0.01, 0.02]), spread, scales, alone))
+            assert np.isfinite(mixture_gain(np.array([0.01, 0.02]), spread, np.arange(2), nothing, alone))

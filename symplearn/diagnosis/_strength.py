@@ -67,8 +67,11 @@ def turning_gain(centre: np.ndarray, spread: np.ndarray, scales: np.ndarray, alo
 
     Of c and e each for itself, most would be dampings that grow with q^2 and drive nothing.
     """
+    if not (np.isfinite(centre).all() and np.isfinite(spread).all()):
+        return 0.0
     size = _widths(_SEEN * np.sqrt(spread[0, 0]) / scales[0], alone)
-    root = np.linalg.cholesky(spread + np.diag(1e-12 * np.diag(spread) + 1e-300))
+    values, vectors = np.linalg.eigh(spread)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))  # round-off may leave one below zero
     grid = np.linspace(-_REACH, _REACH, _POINTS)
     normal = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
     points = centre + normal @ root.T
