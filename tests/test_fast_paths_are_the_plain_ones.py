@@ -44,6 +44,7 @@ def test_a_product_by_terms_is_the_product(right):
         (lambda x: jax.vmap(product_by_terms, (0, None))(x, right[1]), lambda x: x @ right[1]),
     ):
         assert_same_in_value_and_derivatives(fast, plain, left)
+        # Round-off of three terms, with room for another order of additions; so below.
         np.testing.assert_allclose(jax.jacfwd(fast)(left), jax.jacfwd(plain)(left), rtol=1e-12, atol=1e-12)
     by_right = (jax.jacrev(jax.vmap(f, (None, 0)), 1)(left[0], right) for f in (product_by_terms, jnp.matmul))
     np.testing.assert_allclose(*by_right, rtol=1e-12, atol=1e-12)
@@ -154,6 +155,7 @@ def test_a_long_recording_in_stretches_is_the_same(monkeypatch, escapes):
     assert (float(found[0][0]) == -1e15) is escapes
     assert escapes or not np.any(np.asarray(found[0][1]) == 0.0)
     for one, other in zip(*found, strict=True):
+        # Round-off of 23 filter steps, in another order of additions.
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
 
 
@@ -165,7 +167,7 @@ def test_forward_and_reverse_mode_agree():
 
     for size in (1, 2, 13):
         at = jnp.linspace(0.1, 1.0, size)
-        np.testing.assert_allclose(jax.grad(guarded(score, size))(at), jax.grad(score)(at), rtol=1e-12)
+        np.testing.assert_allclose(jax.grad(guarded(score, size))(at), jax.grad(score)(at), rtol=1e-12)  # round-off
 
 
 def test_a_score_without_a_reverse_has_its_forward_slope():

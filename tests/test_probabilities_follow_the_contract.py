@@ -198,6 +198,7 @@ def test_what_was_not_fitted_may_be_too_weak_to_be_seen(problem):
     one = (place(problem, "viscous_damping", "q1"),)
     p = posterior(problem, found(problem, estimate(problem, (), 0.0), estimate(problem, one, -2.0, sd=0.01)), 1.0)
     rest = 1 - 1 / FAMILIES - DAMPING
+    # Round-off of logarithms of ratios.
     assert p.faint / p.as_it_is == pytest.approx(rest * np.log10(4 * 0.01 / 1e-4) / 4, rel=1e-9)
     everything = [estimate(problem, c, 0.0) for c in singles(problem)]
     assert posterior(problem, found(problem, estimate(problem, (), 0.0), *everything), 1.0).faint == 0.0
