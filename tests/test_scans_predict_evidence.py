@@ -161,6 +161,23 @@ def test_a_start_is_where_the_refit_ends(stepper, priors, starts):
         np.testing.assert_allclose(s.z, z, atol=1e-6)
 
 
+def test_what_was_found_follows_what_is_added(stepper, priors):
+    """Beside a fitted sensor bias, a drift's or a constant force's start is the refit of both together: the bias moves,
+    too."""
+    p, priors = stepper.problem, replace(priors, lower=np.full_like(priors.lower, -np.inf))
+    bias, *others = (next(m for m in p.searched if p.candidate(m).effect.name == e)
+                     for e in ("sensor_bias", "sensor_drift", "constant_force"))  # fmt: skip
+    begin = calibrate(stepper, priors.mean[None], [(bias,)], priors, ROWS, tolerance=1e-12)
+    grams = on_trajectory(stepper, begin, 0, ROWS)
+    found = scan(p, grams, begin.z[0], (bias,), priors, [Unit(m, None) for m in others])
+    some = [next(s for s in found if set(s.combination) == {bias, m}) for m in others]
+    refits = calibrate(stepper, np.stack([s.z for s in some]), [s.combination for s in some], priors, ROWS,
+                       tolerance=1e-12)  # fmt: skip
+    for s, z in zip(some, refits.z, strict=True):
+        np.testing.assert_allclose(s.z, z, atol=1e-6)
+        assert abs(s.z[dict(p.placed(s.combination))[bias]] - begin.z[0][p.slots]) > 1e-3
+
+
 def best(starts, problem, effect):
     mine = [s for s in starts if problem.candidate(s.combination[0]).effect.name == effect]
     top = max(mine, key=lambda s: s.gain)

@@ -108,6 +108,29 @@ def test_what_lies_far_off_is_suspected():
     assert not found[:, 1].any()
 
 
+NOISES = {
+    "gaussian": lambda rng, n: rng.normal(size=n),
+    "uniform": lambda rng, n: rng.uniform(-np.sqrt(3), np.sqrt(3), n),
+    "student": lambda rng, n: np.sqrt(0.6) * rng.standard_t(5, n),
+    "quantised": lambda rng, n: 1.6 * np.round(rng.normal(size=n) / 1.6),
+}
+
+
+@pytest.mark.parametrize("noise", NOISES)
+def test_a_noise_of_two_scales_is_told_from_any_of_one(noise):
+    """Of 30 columns with a few errors drawn with seven times the noise's sd nearly all are suspected, wherever the
+    errors come to lie; of 30 without, next to none beyond those that Student's t sends out by itself."""
+    rng = np.random.default_rng(7)
+    both = [0, 0]
+    for _ in range(30):
+        e = NOISES[noise](rng, 200)
+        off = np.zeros(200)
+        off[rng.choice(200, 6, replace=False)] = 7.0 * rng.normal(size=6)
+        both = [k + bool(suspects([column[:, None]])[0].any()) for k, column in zip(both, (e, e + off), strict=True)]
+    # One of 1000 of Student's errors lies six robust standard deviations off, a fifth of the columns have one.
+    assert both[0] <= (12 if noise == "student" else 1) and both[1] >= 27
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_gaussian_readings_are_not_suspected(seed):
     """None of ten thousand, missing ones among them: six standard deviations are passed once in 5e8."""

@@ -92,7 +92,8 @@ def layout(problem: Problem, lane: Sequence[Unit]) -> tuple[np.ndarray, np.ndarr
     return values, matrix, amplitudes
 
 
-# Gram matrices by recording of the columns [1, x_0, calibrated, amplitudes] of every unit of some lanes.
+# Gram matrices by recording of the columns [1, x_0, calibrated, slots, amplitudes] of every unit of some lanes: what a
+# recording depends on (`Problem.local`) under the combination that was fitted, and the amplitudes that it lacks.
 Grams = Callable[[Sequence[Sequence[Unit]]], list[list[list[np.ndarray]]]]
 
 
@@ -101,14 +102,14 @@ def on_trajectory(stepper: Stepper, fits: Fits, lane: int, rows: Sequence[int]) 
     problem, combination = stepper.problem, fits.combinations[lane]
     weight = weights(problem, rows)
     r = residuals(problem, fits.predictions, weight)
-    unknown = problem.state + problem.calibrated.size
+    unknown = problem.state + problem.calibrated.size  # the slots of `responses` are those of the units
 
     def of(lanes: Sequence[Sequence[Unit]]) -> list[list[list[np.ndarray]]]:
         laid = [layout(problem, units) for units in lanes]
         found: list[list[list[np.ndarray]]] = [[[] for _ in units] for units in lanes]
         for k, w in enumerate(weight):
             root = np.where(w > 0, np.sqrt(w), 0.0) / fits.noise[lane]
-            known = fits.predictions[k].slopes[lane, :unknown]
+            known = fits.predictions[k].slopes[lane]
             slopes = stepper.responses(fits.z[lane], combination, laid, rows[k], k)
             for b, (units, (_, _, amplitudes)) in enumerate(zip(lanes, laid, strict=True)):
                 for u, unit in enumerate(units):
@@ -126,7 +127,8 @@ def on_trajectory(stepper: Stepper, fits: Fits, lane: int, rows: Sequence[int]) 
 
 
 def on_path(stepper: Stepper, fit: PathFit, rows: Sequence[int]) -> Grams:
-    """Grams about a path with a missing force: innovations, which follow the recording however far it has gone."""
+    """Grams about a path without effects but a missing force: innovations, which follow the recording however far it
+    has gone."""
     problem = stepper.problem
     unknown = 1 + problem.state + problem.calibrated.size
 
@@ -138,7 +140,10 @@ def on_path(stepper: Stepper, fit: PathFit, rows: Sequence[int]) -> Grams:
             for b, (units, (_, _, amplitudes)) in enumerate(zip(lanes, laid, strict=True)):
                 for u in range(len(units)):
                     some = np.concatenate([np.arange(unknown), unknown + amplitudes[u]])
-                    found[b][u].append(grams[b][np.ix_(some, some)])
+                    place = np.where(some < unknown, some, unknown + SLOTS + np.arange(len(some)) - unknown)
+                    full = np.zeros((unknown + SLOTS + len(amplitudes[u]),) * 2)
+                    full[np.ix_(place, place)] = grams[b][np.ix_(some, some)]
+                    found[b][u].append(full)
         return found
 
     return of
@@ -175,7 +180,6 @@ def noise_starts(problem: Problem, fits: Fits, rows: Sequence[int]) -> list[Star
     r = residuals(problem, fits.predictions, weight)
     square = sum((w * (x[0] / fits.noise[0]) ** 2).sum(0) for w, x in zip(weight, r, strict=True))
     number = np.maximum(sum((w > 0).sum(0) for w in weight), 1)
-    bare = np.where(np.arange(len(z)) < problem.slots, z, 0.0)
     found = []
     for member in problem.searched:
         one = problem.candidate(member)
@@ -183,7 +187,7 @@ def noise_starts(problem: Problem, fits: Fits, rows: Sequence[int]) -> list[Star
             factor = max(float(square[one.place] / number[one.place]), 1e-300)
             gain = 0.5 * float(number[one.place]) * (factor - 1.0 - np.log(factor))
             larger, unit = tuple(sorted((*combination, member))), Unit(member, None)
-            begin = placed(problem, z, bare.copy(), combination, larger, member, np.zeros(one.effect.size), unit)
+            begin = placed(problem, z, combination, larger, member, np.zeros(one.effect.size), unit)
             found.append(Start(larger, begin, gain))
     return found
 

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,6 +21,9 @@ _SHARE, _SIZE = 0.2, 1.5
 # A reading is suspected where it lies this many robust standard deviations off; Student's t of 5 degrees of freedom
 # sends one in a thousand there.
 _SUSPECT = 6.0
+# Where a noise of two scales may begin, in robust standard deviations, and by how many nats it has to be likelier than
+# the likeliest of one, Gaussian or Student's; how probable it is then that a reading is of the wider one.
+_EDGE, _APART, _CLEARLY = 2.5, 3.0, 0.9
 _ROUNDS = 50
 
 
@@ -69,16 +73,58 @@ def suspects(
 ) -> list[Bool[np.ndarray, "_ channel"]]:
     """Readings that lie far off, by recording; at most the share that the prior of outliers allows."""
     joined = np.concatenate(errors)
-    out = []
     with np.errstate(invalid="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a column in which nothing was read has no median
         middle = np.nanmedian(joined, axis=0)
         spread = 1.4826 * np.nanmedian(np.abs(joined - middle), axis=0)
-        far = np.abs(joined - middle) > _SUSPECT * np.maximum(spread, 1e-300)
+        e = (joined - middle) / np.maximum(spread, 1e-300)
+        far = np.abs(e) > _SUSPECT
+    far |= np.stack([_stand_apart(column) for column in e.T], axis=1)
     far &= far.mean(0) < _SHARE
-    ends = np.cumsum([len(e) for e in errors])[:-1]
-    out = np.split(far, ends)
+    return np.split(far, np.cumsum([len(one) for one in errors])[:-1])
+
+
+def _stand_apart(e: Float[np.ndarray, " row"]) -> Bool[np.ndarray, " row"]:
+    """Errors of the wider of two scales, where two scales are much likelier than any noise of one."""
+    seen = np.isfinite(e)
+    x, out = e[seen], np.zeros(len(e), bool)
+    wide = np.abs(x) > _EDGE
+    if not 0 < wide.mean() < _SHARE:
+        return out
+    scales = Scales(float(wide.mean()), float(np.sqrt(np.mean(x[wide] ** 2))), float(np.sqrt(np.mean(x[~wide] ** 2))))
+    for _ in range(_ROUNDS):
+        scales = scales.refined(x, scales.belongs(x))
+    one = max(float(norm.logpdf(x, scale=np.sqrt(np.mean(x**2))).sum()), _student(x, True))
+    if scales.log_likelihood(x) > one + _APART and scales.share < _SHARE:
+        out[seen] = scales.belongs(x) > _CLEARLY
     return out
+
+
+class Scales(NamedTuple):
+    """A noise of two scales: a share of the errors has a Gaussian one of sd `size` on top of that of sd `core`."""
+
+    share: float
+    size: float
+    core: float = 1.0
+
+    def _logs(self, e: np.ndarray) -> np.ndarray:
+        wide = norm.logpdf(e, scale=np.hypot(self.size, self.core))
+        with np.errstate(divide="ignore"):
+            return np.stack([np.log(self.share) + wide, np.log1p(-self.share) + norm.logpdf(e, scale=self.core)])
+
+    def belongs(self, e: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
+        """Probability that each error has the wider noise."""
+        logs = self._logs(e)
+        return np.asarray(np.exp(logs[0] - np.logaddexp(*logs)))
+
+    def log_likelihood(self, e: Float[np.ndarray, " row"]) -> float:
+        return float(np.logaddexp(*self._logs(e)).sum())
+
+    def refined(self, e: Float[np.ndarray, " row"], belongs: Float[np.ndarray, " row"]) -> "Scales":
+        """The next step of expectation and maximisation, the core free."""
+        core = float(np.sqrt(((1 - belongs) * e**2).sum() / max((1 - belongs).sum(), 1e-300)))
+        square = float((belongs * e**2).sum() / max(belongs.sum(), 1e-300))
+        return Scales(float(belongs.mean()), float(np.sqrt(max(square - core**2, core**2))), max(core, 1e-300))
 
 
 def outlier_evidence(
@@ -113,11 +159,10 @@ def outliers(errors: Float[np.ndarray, " row"], flagged: Bool[np.ndarray, " row"
     e, off = errors[seen], flagged[seen]
     if not off.any():
         return 0.0, 0.0
-    share, size = float(off.mean()), float(np.sqrt(np.mean(e[off] ** 2)))
+    scales = Scales(float(off.mean()), float(np.sqrt(np.mean(e[off] ** 2))))
     for _ in range(_ROUNDS):
-        odds = share * norm.pdf(e, scale=np.hypot(size, 1.0))
-        belongs = odds / np.maximum(odds + (1 - share) * norm.pdf(e), 1e-300)
+        belongs = scales.belongs(e)
         belongs[off] = 1.0
-        share = float(belongs.mean())
         size = float(np.sqrt(max((belongs * e**2).sum() / belongs.sum() - 1.0, 1.0)))
-    return share, size
+        scales = Scales(float(belongs.mean()), size)
+    return scales.share, scales.size

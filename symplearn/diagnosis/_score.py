@@ -54,10 +54,10 @@ def nuisance(
 ) -> Nuisance:  # fmt: skip
     """The same for every effect, but for an unseen oscillator, whose start is unknown too."""
     if not kept:
-        kept[0] = _remaining(problem, by_recording, z, combination, priors, ())
+        kept[0] = _remaining(problem, by_recording, z, combination, priors)
     if problem.candidate(member).effect is not effects.HIDDEN:
         return kept[0]
-    found = _remaining(problem, by_recording, z, combination, priors, (member,))
+    found = _remaining(problem, by_recording, z, combination, priors, member)
     width = priors.precision_of(problem, (member,))[_starts(problem, member)]
     return found._replace(gain=found.earned - kept[0].earned + float(0.5 * np.log(width).sum()))
 
@@ -69,23 +69,22 @@ def _starts(problem: Problem, member: int) -> np.ndarray:
 
 def _remaining(
     problem: Problem, by_recording: Sequence[np.ndarray], z, combination: Combination, priors: Priors,
-    added: Combination,
+    unseen: int | None = None,
 ) -> Nuisance:  # fmt: skip
-    n = problem.slots
-    active = problem.active(added)[:n]
-    gram = np.zeros((1 + n, 1 + n))
+    """All unknowns of a combination, and the start of what one further member adds `unseen`."""
+    size = problem.size
+    active, precision = problem.active(combination), priors.precision_of(problem, combination)
+    if unseen is not None:
+        starts = _starts(problem, unseen)
+        active[starts] = True
+        precision[starts] = priors.precision_of(problem, (unseen,))[starts]
+    gram = np.zeros((1 + size, 1 + size))
     for r, own in enumerate(by_recording):
-        place = np.concatenate([[0], 1 + _own(problem, r)])
+        place = np.concatenate([[0], 1 + problem.local(r)])
         gram[np.ix_(place, place)] += own[: len(place), : len(place)]
-    precision = priors.precision_of(problem, added)[:n]
-    vector = gram[0, 1:] - precision * (z - priors.mean_of(problem, combination))[:n]
+    vector = gram[0, 1:] - precision * (z - priors.mean_of(problem, combination))
     inverse = _inverse(gram[1:, 1:][np.ix_(active, active)] + np.diag(precision[active]))
     return Nuisance(active, inverse, vector[active])
-
-
-def _own(problem: Problem, recording: int) -> np.ndarray:
-    """Entries of z that one recording depends on beside the values of effects."""
-    return problem.local(recording)[: problem.state + problem.calibrated.size]
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
@@ -102,11 +101,11 @@ def score(
     member: int, others: Nuisance,
 ) -> Start | None:  # fmt: skip
     """The step that a unit's amplitudes and everything else would take, and what it gains."""
-    one, n = problem.candidate(member), problem.slots
+    one = problem.candidate(member)
     number = one.effect.amplitudes
-    cross, square, vector = np.zeros((n, number)), np.zeros((number, number)), np.zeros(number)
+    cross, square, vector = np.zeros((problem.size, number)), np.zeros((number, number)), np.zeros(number)
     for r in problem.members[member].recordings:
-        own, gram = _own(problem, r), by_recording[r]
+        own, gram = problem.local(r), by_recording[r]
         k = 1 + len(own)
         cross[own] += gram[1:k, k:]
         square, vector = square + gram[k:, k:], vector + gram[0, k:]
@@ -130,13 +129,12 @@ def score(
         shape = np.outer(scales, scales)
         gain += mixture_gain(amplitudes / scales, spread / shape, np.zeros(number, int), lowest / scales)
     larger = tuple(sorted((*combination, member)))
-    begin = z.copy()
-    begin[:n][others.active] += others.inverse @ others.vector - after @ amplitudes
-    begin[n:] = 0.0
-    bare = np.where(np.arange(len(z)) < n, z, 0.0)
+    moved = z.copy()
+    moved[others.active] += others.inverse @ others.vector - after @ amplitudes
+    moved = np.clip(moved, *priors.bounds_of(problem, combination))
     ends = [
-        placed(problem, z, at, combination, larger, member, size, unit)
-        for at, size in ((begin, amplitudes), (bare, np.zeros(number)))
+        placed(problem, at, combination, larger, member, size, unit)
+        for at, size in ((moved, amplitudes), (z, np.zeros(number)))
     ]
     return Start(larger, ends[0], float(gain), ends[1])
 
@@ -157,12 +155,13 @@ def _unseen_strength(problem, member: int, priors: Priors, others: Nuisance, aft
     return mixture_gain(centre / scales, joint / shape, np.zeros(len(centre), int), lowest)
 
 
-def placed(problem, z, begin, combination, larger, member, amplitudes, unit: Unit) -> np.ndarray:
-    """Values of the old effects where they are, and of the new one where the step puts them."""
-    old = dict(problem.placed(combination))
+def placed(problem, z, combination, larger, member, amplitudes, unit: Unit) -> np.ndarray:
+    """Unknowns and old effects as they are in z, and the new effect of given amplitudes at the unit's place."""
+    old, out = dict(problem.placed(combination)), z.copy()
+    out[problem.slots :] = 0.0
     for m, place in problem.placed(larger):
         if m == member:
-            begin[place] = np.append(amplitudes, [] if unit.place is None else [unit.place])
+            out[place] = np.append(amplitudes, [] if unit.place is None else [unit.place])
         else:
-            begin[place] = z[old[m]]
-    return begin
+            out[place] = z[old[m]]
+    return out
