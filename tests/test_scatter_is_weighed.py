@@ -108,11 +108,12 @@ def test_what_lies_far_off_is_suspected():
     assert not found[:, 1].any()
 
 
+quantised = lambda x: 1.6 * np.round(x / 1.6)  # noqa: E731
 NOISES = {
     "gaussian": lambda rng, n: rng.normal(size=n),
     "uniform": lambda rng, n: rng.uniform(-np.sqrt(3), np.sqrt(3), n),
     "student": lambda rng, n: np.sqrt(0.6) * rng.standard_t(5, n),
-    "quantised": lambda rng, n: 1.6 * np.round(rng.normal(size=n) / 1.6),
+    "quantised": lambda rng, n: quantised(30 * np.sin(np.arange(n)) + rng.normal(size=n)) - 30 * np.sin(np.arange(n)),
 }
 
 
