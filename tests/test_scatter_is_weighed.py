@@ -132,6 +132,20 @@ def test_a_noise_of_two_scales_is_told_from_any_of_one(noise):
     assert both[0] <= (12 if noise == "student" else 1) and both[1] >= 27
 
 
+def test_a_motion_that_is_missed_for_a_while_is_no_outlier():
+    """Errors of seven standard deviations that stand in rows are left where they are; single ones beside them are
+    suspected, and so are neighbours where one reading in seven is off."""
+    rng = np.random.default_rng(8)
+    e = rng.normal(size=(300, 2))
+    e[100:112, 0] += 7.0
+    e[[20, 60, 200, 250], 0] += 12.0
+    off = rng.random(300) < 1 / 7
+    e[off, 1] += 15.0 * np.sign(rng.normal(size=off.sum()))
+    (found,) = suspects([e])
+    assert np.nonzero(found[:, 0])[0].tolist() == [20, 60, 200, 250]
+    assert (off[1:] & off[:-1]).any() and np.array_equal(found[:, 1], off)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_gaussian_readings_are_not_suspected(seed):
     """None of ten thousand, missing ones among them: six standard deviations are passed once in 5e8."""

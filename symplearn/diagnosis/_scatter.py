@@ -25,6 +25,8 @@ _SUSPECT = 6.0
 # the likeliest of one, Gaussian or Student's; how probable it is then that a reading is of the wider one.
 _EDGE, _APART, _CLEARLY = 2.5, 3.0, 0.9
 _ROUNDS = 50
+# Standard deviations by which neighbours may lie off together more often than chance has it.
+_CHANCE = 3.0
 
 
 def law_gain(
@@ -81,7 +83,20 @@ def suspects(
         far = np.abs(e) > _SUSPECT
     far |= np.stack([_stand_apart(column) for column in e.T], axis=1)
     far &= far.mean(0) < _SHARE
-    return np.split(far, np.cumsum([len(one) for one in errors])[:-1])
+    parts = np.split(far, np.cumsum([len(one) for one in errors])[:-1])
+    clumps = [_clumped(part) for part in parts]
+    # By chance, neighbours both lie off as often as the share squared; a motion that is missed goes on for a while.
+    expected = len(far) * far.mean(0) ** 2
+    chance = sum(clump.sum(0) for clump in clumps) <= 2 * (1 + expected + _CHANCE * np.sqrt(expected))
+    return [part & (chance | ~clump) for part, clump in zip(parts, clumps, strict=True)]
+
+
+def _clumped(far: Bool[np.ndarray, "_ channel"]) -> Bool[np.ndarray, "_ channel"]:
+    """Which of them have a neighbour in time."""
+    pairs, out = far[1:] & far[:-1], np.zeros_like(far)
+    out[1:] |= pairs
+    out[:-1] |= pairs
+    return out
 
 
 def _stand_apart(e: Float[np.ndarray, " row"]) -> Bool[np.ndarray, " row"]:
