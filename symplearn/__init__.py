@@ -31,6 +31,7 @@ from ._evidence import laplace_evidence as laplace_evidence
 from ._expression import parse_expression as parse_expression
 from ._faults import Fault as Fault
 from ._filter import Filtered as Filtered
+from ._filter import Sequential as Sequential
 from ._filter import kalman_filter as kalman_filter
 from ._filter import log_likelihood as log_likelihood
 from ._filter import unscented_filter as unscented_filter
@@ -95,6 +96,7 @@ from ._objectives import MarginalLikelihood as MarginalLikelihood
 from ._objectives import TimeSeries as TimeSeries
 from ._optimisers import Adam as Adam
 from ._optimisers import ByLeaf as ByLeaf
+from ._parallel_filter import ParallelInTime as ParallelInTime
 from ._parameters import Bounded as Bounded
 from ._parameters import Correlation as Correlation
 from ._parameters import Frozen as Frozen

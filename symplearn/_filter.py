@@ -7,7 +7,6 @@ squared norm. The filter carries a square root of the state's covariance, which 
 
 import functools
 import math
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,12 +15,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._errors import InputError
-from ._faults import IMPOSSIBLE, SENTENCES, Fault, first_fault, is_fatal, is_remote
+from ._faults import SENTENCES, Fault, is_fatal
+from ._filter_step import AbstractPassage, begin, measure
 from ._guard import guard
 from ._model import AbstractAffine, AbstractStateSpaceModel, StateSpaceModel, slice_at
-from ._small_products import product
-from ._transforms import STANDARD, AbstractTransform, Moments, Taylor
-from ._triangular import forward_substitution, triangularise
+from ._transforms import STANDARD, AbstractTransform, Taylor
 
 # Bytes of the states of all readings beyond which a gradient does not keep all of them, but takes a third longer.
 _KEPT = 2_000_000
@@ -64,24 +62,33 @@ class Filtered(eqx.Module):
         return f"{count}. {verdict} at reading {int(self.fault_step)}: {SENTENCES[Fault(int(self.fault))]}"
 
 
-class _Carry(NamedTuple):
-    mean: Array
-    root: Array
-    log_likelihood: Array
-    fault: Array
-    fault_step: Array
+class Sequential(AbstractPassage):
+    """One reading after the other. The default: any model, and the least work."""
+
+    def run(self, model, readings, intervals, contexts, transform, keep):
+        model, readings, intervals, contexts = guard((model, readings, intervals, contexts))
+        carry, first = begin(model, transform, readings[0], slice_at(contexts, 0))
+
+        def step(carry, data):
+            reading, interval, context, k = data
+            inside, carry = guard((model, carry))
+            predicted = inside.predict(transform, carry.mean, carry.root, interval)
+            carry, record = measure(inside, transform, carry, predicted, reading, context, k)
+            return carry, (record if keep else None)
+
+        # Checkpointing the step makes the gradient faster as well as 16 times smaller (performance.md, A7).
+        step = jax.checkpoint(step, prevent_cse=False)
+        if keep or len(readings) * sum(leaf.nbytes for leaf in carry) <= _KEPT:
+            later_contexts = jax.tree.map(lambda leaf: leaf[1:], contexts)
+            data = readings[1:], intervals, later_contexts, np.arange(1, len(readings))
+            carry, later = jax.lax.scan(step, carry, data)
+        else:
+            carry, later = _in_stretches(step, carry, (readings, contexts), intervals), None
+        # What a last step leaves in the tangents is past every guard inside.
+        return carry._replace(log_likelihood=guard(carry.log_likelihood)), first, later
 
 
-class _Record(NamedTuple):
-    increment: Array
-    predicted_mean: Array
-    predicted_covariance: Array
-    filtered_mean: Array
-    filtered_covariance: Array
-    innovation: Array
-    innovation_covariance: Array
-    standardised_innovation: Array
-    observed: Array
+SEQUENTIAL = Sequential()
 
 
 def unscented_filter(
@@ -90,19 +97,21 @@ def unscented_filter(
     intervals: PyTree,
     contexts: PyTree = None,
     transform: AbstractTransform = STANDARD,
+    passage: AbstractPassage = SEQUENTIAL,
 ) -> Filtered:
     """Filter a recording and keep everything the smoother and a diagnosis need. Algorithm 2, corrected.
 
     **Arguments:** `model` - with plain arrays (see `resolve`) and an `initial` Gaussian; `readings` - NaN
     where missing, in whole rows or in part; `intervals` - a pytree with leading axis time - 1, one slice per
     data interval; `contexts` - a pytree with leading axis time for the observation, or None; `transform` -
-    the rule for the moments of what is not affine: `UnscentedTransform`, `Cubature`, `GaussHermite` or `Taylor`.
+    the rule for the moments of what is not affine: `UnscentedTransform`, `Cubature`, `GaussHermite` or `Taylor`;
+    `passage` - one reading after the other, `Sequential`, or all side by side, `ParallelInTime`, for affine models.
 
     Works under `jit`, `vmap`, `jacfwd` and `grad`. A failure is a value: see `Filtered.fault`; derivatives are then 0.
     """
-    carry, first, later = _run(model, readings, intervals, contexts, transform, keep=True)
+    carry, first, later = passage.run(model, readings, intervals, contexts, transform, keep=True)
     history = [jnp.concatenate([one[None], rest]) for one, rest in zip(first, later, strict=True)]
-    # The fields of `_Record` are those of `Filtered` between the first and the faults.
+    # The fields of `Record` are those of `Filtered` between the first and the faults.
     return Filtered(*(carry.log_likelihood, *history, carry.fault, carry.fault_step))
 
 
@@ -112,16 +121,21 @@ def log_likelihood(
     intervals: PyTree,
     contexts: PyTree = None,
     transform: AbstractTransform = STANDARD,
+    passage: AbstractPassage = SEQUENTIAL,
 ) -> Float[Array, ""]:
     """The log marginal likelihood (2.4) in nats, without a history; -1e15 where the filter failed.
 
     Arguments as for `unscented_filter`.
     """
-    return _run(model, readings, intervals, contexts, transform, keep=False)[0].log_likelihood
+    return passage.run(model, readings, intervals, contexts, transform, keep=False)[0].log_likelihood
 
 
 def kalman_filter(
-    model: StateSpaceModel, readings: Float[Array, "time channel"], intervals: PyTree, contexts: PyTree = None
+    model: StateSpaceModel,
+    readings: Float[Array, "time channel"],
+    intervals: PyTree,
+    contexts: PyTree = None,
+    passage: AbstractPassage = SEQUENTIAL,
 ) -> Filtered:
     """The Kalman filter, exact for a model whose dynamics and observation are affine (3.1). Algorithm 4, corrected.
 
@@ -135,35 +149,7 @@ def kalman_filter(
                 f"`kalman_filter` is for affine models, but the {name} is `{type(part).__name__}`; use "
                 "`unscented_filter`, or make it a subclass of `AbstractAffine`."
             )
-    return unscented_filter(model, readings, intervals, contexts, Taylor())
-
-
-def _run(model, readings, intervals, contexts, transform, keep):
-    """Measure at k = 0, then predict and measure through every data interval."""
-    model = guard(model)
-    mean, root = jnp.asarray(model.initial.mean), model.initial.root
-    none = jnp.asarray(int(Fault.NONE))
-    start = _Carry(mean, root, jnp.zeros((), mean.dtype), none, jnp.asarray(-1))
-    predicted = Moments(mean, root, jnp.zeros((mean.shape[0], 0)))
-    carry, first = _measure(model, transform, start, predicted, readings[0], slice_at(contexts, 0), 0)
-
-    def step(carry, data):
-        reading, interval, context, k = data
-        inside, carry = guard((model, carry))
-        predicted = inside.predict(transform, carry.mean, carry.root, interval)
-        carry, record = _measure(inside, transform, carry, predicted, reading, context, k)
-        return carry, (record if keep else None)
-
-    # Checkpointing the step makes the gradient faster as well as 16 times smaller (performance.md, A7).
-    step = jax.checkpoint(step, prevent_cse=False)
-    if keep or len(readings) * sum(leaf.nbytes for leaf in carry) <= _KEPT:
-        later_contexts = jax.tree.map(lambda leaf: leaf[1:], contexts)
-        data = readings[1:], intervals, later_contexts, np.arange(1, len(readings))
-        carry, later = jax.lax.scan(step, carry, data)
-    else:
-        carry, later = _in_stretches(step, carry, (readings, contexts), intervals), None
-    # What a last step leaves in the tangents is past every guard inside.
-    return carry._replace(log_likelihood=guard(carry.log_likelihood)), first, later
+    return unscented_filter(model, readings, intervals, contexts, Taylor(), passage)
 
 
 def _in_stretches(step, carry, of_readings, intervals):
@@ -176,8 +162,8 @@ def _in_stretches(step, carry, of_readings, intervals):
     length = math.isqrt(count) + 1
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
-    def stretch(carry, begin):
-        places = begin + np.arange(length)
+    def stretch(carry, at):
+        places = at + np.arange(length)
         readings, contexts = jax.tree.map(lambda leaf: jnp.take(leaf, places, axis=0, mode="clip"), of_readings)
         inside = jax.tree.map(lambda leaf: jnp.take(leaf, places - 1, axis=0, mode="clip"), intervals)
         return jax.lax.scan(within, carry, (readings, inside, contexts, places))[0], None
@@ -187,59 +173,3 @@ def _in_stretches(step, carry, of_readings, intervals):
         return jax.tree.map(lambda new, old: jnp.where(data[-1] < count, new, old), after, carry), None
 
     return jax.lax.scan(stretch, carry, np.arange(1, count, length))[0]
-
-
-def _measure(model, transform, carry, predicted, reading, context, k):
-    """Condition the prediction on one reading, (2.7)-(2.8), by one triangularisation of the joint square root.
-
-    [F_y; F_x] -> [S^1/2, 0; G, P+^1/2] with m+ = m + G e and e = S^-1/2 r. A missing channel has a row of zeros, which
-    leaves everything else as if it were absent.
-    """
-    m, factor, _ = predicted
-    # An exact reading takes the prediction's wide factor as it is and spares a triangularisation.
-    root = factor if model.reads_exactly else triangularise(factor)[0]
-    mean, rows, source = model.read(transform, m, root, context)
-    seen = ~jnp.isnan(reading)
-    channels = reading.shape[0]
-    masked = jnp.where(seen[:, None], rows, 0.0)
-    triangle, good = triangularise(jnp.concatenate([masked, source]))
-    S_root, G = triangle[:channels, :channels], triangle[channels:, :channels]
-    r = jnp.where(seen, jnp.where(seen, reading, 0.0) - mean, 0.0)
-    e = forward_substitution(S_root, r)
-    # Not `jnp.diagonal`, whose derivative is a scatter, with which no loop is compiled as one function.
-    diagonal = jnp.sum(jnp.where(np.eye(channels, dtype=bool), S_root, 0.0), axis=1)
-    pivots = jnp.where(seen & good[:channels], diagonal, 1.0)
-    increment = -0.5 * product(e, e) - jnp.sum(jnp.log(pivots)) - 0.5 * math.log(2 * math.pi) * jnp.sum(seen)
-    fault = first_fault(
-        (jnp.all(jnp.isfinite(m)), Fault.STATE),
-        (jnp.all(jnp.isfinite(factor)), Fault.COVARIANCE),
-        (jnp.all(jnp.isfinite(jnp.where(seen, mean, 0.0))) & jnp.all(jnp.isfinite(masked)), Fault.READING),
-        (jnp.all(good[:channels] | ~seen), Fault.SINGULAR),
-        (carry.log_likelihood + increment > IMPOSSIBLE, Fault.UNREACHED),
-        (~is_remote(e), Fault.REMOTE),
-    )
-    after = _accept(model, carry, m + product(G, e), triangle[channels:, channels:], increment, fault, k)
-    if_ok = after.log_likelihood - carry.log_likelihood
-    moments = after.mean, product(after.root, after.root.T)
-    record = _Record(if_ok, m, product(factor, factor.T), *moments, r, product(rows, rows.T), e, seen)
-    return after, jax.tree.map(_tidy, record)
-
-
-def _tidy(leaf: Array) -> Array:
-    """Zero for what is not finite, which only a failed step leaves behind."""
-    return jnp.where(jnp.isfinite(leaf), leaf, jnp.zeros_like(leaf))
-
-
-def _accept(model, carry, mean, root, increment, fault, k):
-    """The next carry, or a harmless fixed one from the first fatal fault on: no NaN is computed with."""
-    failed = is_fatal(carry.fault) | is_fatal(fault)
-    first = (carry.fault == Fault.NONE) | (~is_fatal(carry.fault) & is_fatal(fault))
-    noted = (fault != Fault.NONE) & first
-    refuge = jax.lax.stop_gradient(jnp.nan_to_num(jnp.asarray(model.initial.mean)))
-    return _Carry(
-        jnp.where(failed, refuge, mean),
-        jnp.where(failed, 0.0, root),
-        jnp.where(failed, IMPOSSIBLE, carry.log_likelihood + increment),
-        jnp.where(noted, fault, carry.fault),
-        jnp.where(noted, k, carry.fault_step),
-    )

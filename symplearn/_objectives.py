@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._errors import InputError
-from ._filter import Filtered, log_likelihood, unscented_filter
+from ._filter import SEQUENTIAL, Filtered, log_likelihood, unscented_filter
+from ._filter_step import AbstractPassage
 from ._model import (
     AbstractStateSpaceModel,
     FullState,
@@ -122,22 +123,24 @@ class MarginalLikelihood(AbstractObjective):
 
     The propagator's intervals are those between the recording's times. Without an `initial` distribution the
     first reading of the full state is conditioned on, which is a flat prior on the state it reads. `transform` is the
-    rule for the moments of what is not affine.
+    rule for the moments of what is not affine. `passage` is `Sequential()`, or `ParallelInTime()`, for linear models
+    with long recordings on a GPU.
     """
 
     transform: AbstractTransform = STANDARD
+    passage: AbstractPassage = SEQUENTIAL
 
     def score(self, model: AbstractStateSpaceModel, series: TimeSeries) -> Float[Array, ""]:
-        return -log_likelihood(*prepare(model, series), transform=self.transform)
+        return -log_likelihood(*prepare(model, series), transform=self.transform, passage=self.passage)
 
     def filter(self, model: AbstractStateSpaceModel, recording: Any) -> Filtered:
         """The filter's history behind the score of one recording."""
-        return _filter(model, as_time_series(recording), self.transform)
+        return _filter(model, as_time_series(recording), self)
 
 
 @eqx.filter_jit
-def _filter(model: AbstractStateSpaceModel, series: TimeSeries, transform: AbstractTransform) -> Filtered:
-    return unscented_filter(*prepare(model, series), transform=transform)
+def _filter(model: AbstractStateSpaceModel, series: TimeSeries, by: MarginalLikelihood) -> Filtered:
+    return unscented_filter(*prepare(model, series), transform=by.transform, passage=by.passage)
 
 
 MARGINAL_LIKELIHOOD = MarginalLikelihood()
