@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from .._effects import OUTLIERS, Candidate
+from .._effects import HIDDEN, OUTLIERS, Candidate
 from ._calibrate import Fits, Priors, estimate_noise, residuals, weights
 from ._effect_priors import motion_along, with_effects, with_unnamed
+from ._exchange import Regression
 from ._found import Found
 from ._noisy import PathFit, fit_paths
 from ._null_paths import beside, null_paths
@@ -27,6 +28,8 @@ _REACH = 30.0
 _BASES, _PAIRS, _WORTH = 4, 32, 2.0
 # Nats by which a missing force may lead for effects to count as small, and how many of those are then fitted.
 _QUIET, _SMALL = 3.0, 24
+# Effects of the highest scores that may take another's part, beside all those without a place.
+_EXCHANGED = 24
 # Combinations that a missing force is tried beside.
 _FORCED = 6
 # Combinations that are fitted between two looks at the clock.
@@ -238,6 +241,8 @@ class Search:
             promised = [replace(start, gain=start.gain + white.log_evidence) for start in mine]
             # As many of each: what a score promises about a poor fit is too much.
             self._keep(promised, kept)
+            if not k:
+                self._weigh_exchanged(c, white.z, mine, size)
         return sorted(kept.values(), key=lambda start: -start.gain)
 
     def _keep(self, listed: Sequence[Start], kept: dict[tuple[Combination, int], Start]) -> None:
@@ -303,15 +308,39 @@ class Search:
 
     def _scanned(self, combination: Combination, z: np.ndarray, most: int) -> list[Start]:
         """Starts with one effect more than a fitted combination."""
+        fits = self._fitted(combination, z)
+        if fits is None:
+            return []
+        grams = on_trajectory(self.stepper, fits, 0, self.rows)
+        wrong = noise_starts(self.problem, fits, self.rows)
+        return wrong + scan(self.problem, grams, z, combination, self.found.priors, self._units(most))
+
+    def _fitted(self, combination: Combination, z: np.ndarray) -> Fits | None:
+        """A combination as it was fitted; None where it ran away."""
         problem, weight = self.problem, weights(self.problem, self.rows)
         predictions = self.stepper.predict(z[None], [combination], self.rows)
         noise = estimate_noise(problem, [combination], residuals(problem, predictions, weight), weight)
         fits = Fits([combination], z[None], noise, predictions, np.zeros(1), np.ones(1, bool))
-        if not np.isfinite(noise).all():
-            return []
-        grams = on_trajectory(self.stepper, fits, 0, self.rows)
-        wrong = noise_starts(problem, fits, self.rows)
-        return wrong + scan(problem, grams, z, combination, self.found.priors, self._units(most))
+        return fits if np.isfinite(noise).all() else None
+
+    def _weigh_exchanged(self, combination: Combination, z: np.ndarray, found: Sequence[Start], size: int) -> None:
+        """Combinations of one size that may do as well as the best of the size below, whose members they need not
+        have: of all effects without a place, and of others where one more of them helps most."""
+        problem, fits = self.problem, self._fitted(combination, z)
+        units = {m: Unit(m, None) for m in problem.searched if not problem.candidate(m).effect.places}
+        for start in sorted(found, key=lambda start: -start.gain)[:_EXCHANGED]:
+            (member,) = set(start.combination) - set(combination)
+            place = dict(problem.placed(start.combination))[member].stop - 1
+            is_placed = bool(problem.candidate(member).effect.places)
+            units.setdefault(member, Unit(problem.whole(member), float(start.z[place]) if is_placed else None))
+        some = {m: unit for m, unit in units.items() if problem.candidate(m).effect.amplitudes and m not in combination
+                and problem.candidate(m).effect is not HIDDEN}  # fmt: skip
+        if fits is not None and some:
+            regression = Regression(self.stepper, fits, self.rows, self.found.priors, some)
+            known = self.found.estimates.__contains__
+            starts = regression.subsets(size + len(self.base), known, _PAIRS // _BASES)
+            # From a trajectory that all rows are near to.
+            self.weigher.weigh(starts, whole=True)
 
     def _gained(self, size: int) -> bool:
         """Whether the best of this size beats the best of smaller ones, so that a larger one may be worth it."""
