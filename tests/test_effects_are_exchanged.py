@@ -1,0 +1,150 @@
+"""About a fitted trajectory all combinations of a size are compared, also those that share nothing with what was
+fitted."""
+
+import itertools
+from dataclasses import replace
+
+import engine_cases as cases
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from test_scans_predict_evidence import FILE, MASS, NOISE, PULL_SD, SCALE, X0_SD, response
+
+from symplearn.diagnosis._calibrate import calibrate
+from symplearn.diagnosis._exchange import Regression
+from symplearn.diagnosis._score import Unit
+from symplearn.diagnosis._start import priors_without_effects
+from symplearn.diagnosis._strength import WIDTHS
+from symplearn.diagnosis._trajectory import Stepper
+
+TIMES = np.linspace(0.0, 12.0, 80)
+EFFECTS = ("sensor_bias", "sensor_drift", "periodic_forcing")
+FREQUENCY = 0.9
+
+
+def made(drift, bias, force):
+    y = response(TIMES, lambda t: 0.2 + force * np.cos(FREQUENCY * t), [0.4, 0.1])
+    noise = NOISE * np.random.default_rng(3).normal(size=len(TIMES))
+    return cases.recorded(TIMES, y + bias + drift * TIMES + noise)
+
+
+@pytest.fixture(scope="module")
+def stepper():
+    file = cases.simulation(f"p**2/(2*{MASS}) + k*q**2/2 - f*q", more=FILE)
+    return Stepper(cases.problem(file, [made(0.03, 0.2, 0.15)], 0.02))
+
+
+@pytest.fixture(scope="module")
+def priors(stepper):
+    bare, size = priors_without_effects(stepper.problem), stepper.problem.equations.size
+    return replace(bare, scales=np.full(size, SCALE))
+
+
+@pytest.fixture(scope="module")
+def members(stepper):
+    p = stepper.problem
+    return {name: next(m for m in p.searched if p.candidate(m).effect.name == name) for name in EFFECTS}
+
+
+@pytest.fixture(scope="module")
+def fits(stepper, priors, members):
+    """Fitted with a drift alone."""
+    return calibrate(stepper, priors.mean[None], [(members["sensor_drift"],)], priors, [len(TIMES)], tolerance=1e-12)
+
+
+@pytest.fixture(scope="module")
+def starts(stepper, priors, members, fits):
+    units = {m: Unit(m, FREQUENCY if name == "periodic_forcing" else None) for name, m in members.items()
+             if name != "sensor_drift"}  # fmt: skip
+    return Regression(stepper, fits, [len(TIMES)], priors, units).subsets(2, lambda c: False, 8)
+
+
+COLUMNS = {
+    "sensor_bias": [np.ones_like(TIMES)],
+    "sensor_drift": [TIMES],
+    "periodic_forcing": [
+        response(TIMES, lambda t: np.cos(FREQUENCY * t)),
+        response(TIMES, lambda t: np.sin(FREQUENCY * t)),
+    ],
+}
+
+
+def evidence(y, columns, widths):
+    """Log evidence of linear least squares with Gaussian priors, covariance of the columns' factors, and all factors."""
+    sd = np.array([*X0_SD, PULL_SD, *widths])
+    design = np.stack([response(TIMES, start=x) for x in np.eye(2)] + [response(TIMES, lambda t: 1.0), *columns], 1)
+    A = np.vstack([design / NOISE, np.diag(1 / sd)])
+    b = np.concatenate([y / NOISE, np.zeros(len(sd))])
+    z = np.linalg.lstsq(A, b, rcond=None)[0]
+    value = -0.5 * ((b - A @ z) ** 2).sum() - 0.5 * np.linalg.slogdet(A.T @ A)[1] - np.log(sd).sum()
+    return value, np.linalg.inv(A.T @ A)[3:, 3:], z
+
+
+def any_strength(y, names):
+    """The same with each effect of any order of magnitude: from four standard errors to the largest, equally likely."""
+    columns = [column for name in names for column in COLUMNS[name]]
+    own = np.repeat(np.arange(len(names)), [len(COLUMNS[name]) for name in names])
+    covariance = evidence(y, columns, SCALE + 0 * own)[1] / SCALE**2
+    shares = []
+    for k in range(len(names)):
+        told = np.mean(np.maximum(1 / np.linalg.eigvalsh(covariance[np.ix_(own == k, own == k)]) - 1, 0))
+        shares.append(np.geomspace(min(4 / np.sqrt(told), 1.0), 1.0, WIDTHS))
+    each = [evidence(y, columns, SCALE * np.array(c)[own])[0] for c in itertools.product(*shares)]
+    return logsumexp(each) - np.log(len(each))
+
+
+def named(stepper, start):
+    return tuple(stepper.problem.candidate(m).effect.name for m in start.combination)
+
+
+def test_the_gain_of_every_pair_is_that_of_its_refit(stepper, starts):
+    """For effects in which the readings are linear, of all three pairs: NumPy's least squares, each effect of any
+    order of magnitude, against the drift that was fitted."""
+    y = stepper.problem.rows[0].readings[:, 0]
+    assert len(starts) == 3
+    for start in starts:
+        expected = any_strength(y, named(stepper, start)) - any_strength(y, ["sensor_drift"])
+        # The substep's error of the frequency's response.
+        assert start.gain == pytest.approx(expected, abs=1e-3 + 1e-4 * abs(expected))
+
+
+def test_every_pair_begins_where_its_refit_ends(stepper, starts):
+    """The pair without the drift, too: initial state, calibrated force and amplitudes are NumPy's least squares, and a
+    frequency is where it was tried."""
+    p, y = stepper.problem, stepper.problem.rows[0].readings[:, 0]
+    for start in starts:
+        columns = [column for name in named(stepper, start) for column in COLUMNS[name]]
+        z = evidence(y, columns, np.full(len(columns), SCALE))[2]
+        amplitudes = [start.z[place][: p.candidate(m).effect.amplitudes] for m, place in p.placed(start.combination)]
+        found = np.concatenate([start.z[: p.slots][p.active(start.combination)[: p.slots]], *amplitudes])
+        np.testing.assert_allclose(found, z, atol=2e-5)  # the substep's error
+        for m, place in p.placed(start.combination):
+            if p.candidate(m).effect.places:
+                assert start.z[place.stop - 1] == FREQUENCY
+
+
+def test_dry_friction_with_drag_is_found_behind_a_damping():
+    """An oscillator with dry friction and quadratic drag, to which a viscous damping was fitted that leaves more
+    than twice the noise: of all pairs the two are ahead, as strong as they are."""
+    times = np.linspace(0.0, 40.0, 240)
+    rates = lambda t, x: [x[1], -x[0] - 0.004 * np.sign(x[1]) - 0.05 * np.abs(x[1]) * x[1]]  # noqa: E731
+    y = cases.solved(rates, [1.0, 0.0], times, 1e-8)[:, 0] + 0.002 * np.random.default_rng(5).normal(size=len(times))
+    p = cases.problem(
+        cases.simulation("p**2/2 + k*q**2/2", more="[parameters]\nk = 1.0"), [cases.recorded(times, y)], 0.1
+    )
+    stepper, rows, bare = Stepper(p), [len(times)], priors_without_effects(p)
+    priors = replace(bare, scales=np.full(p.equations.size, SCALE), precision=np.full(p.size, 1e-2))
+    damping = next(m for m in p.searched if p.candidate(m).effect.name == "viscous_damping")
+    begin = np.zeros(p.size)
+    begin[[0, p.slots]] = 1.0, 0.02
+    fits = calibrate(stepper, begin[None], [(damping,)], priors, rows)
+    assert fits.converged[0] and fits.noise[0, 0] > 0.004
+    units = {m: Unit(m, None) for m in p.searched if m != damping and not p.candidate(m).effect.places
+             and p.candidate(m).effect.amplitudes}  # fmt: skip
+    found = Regression(stepper, fits, rows, priors, units).subsets(2, lambda c: False, 4)
+    names = [{p.candidate(m).effect.name for m in start.combination} for start in found]
+    assert names[0] == {"coulomb_friction", "quadratic_drag"}
+    for m, place in p.placed(found[0].combination):
+        truth = {"coulomb_friction": 0.004, "quadratic_drag": 0.05}[p.candidate(m).effect.name]
+        # About a motion that is off by more than twice the noise: a fit goes on from there.
+        assert found[0].z[place][0] == pytest.approx(truth, rel=0.2)
