@@ -70,7 +70,7 @@ COLUMNS = {
 
 
 def evidence(y, columns, widths):
-    """Log evidence of linear least squares with Gaussian priors, covariance of the columns' factors, and all factors."""
+    """Log evidence of linear least squares with Gaussian priors, the factors' covariance, and all factors."""
     sd = np.array([*X0_SD, PULL_SD, *widths])
     design = np.stack([response(TIMES, start=x) for x in np.eye(2)] + [response(TIMES, lambda t: 1.0), *columns], 1)
     A = np.vstack([design / NOISE, np.diag(1 / sd)])
