@@ -16,6 +16,8 @@ THINNED = 1.177
 _FLOOR = 1e-9
 # Directions flatter than this share of the steepest are taken as flat.
 _FLAT = 1e-13
+# Of minus twice the log posterior: what a fit may still promise that is as good as done.
+_SLIGHT = 1.0
 # After this many steps a lane that lies this many nats behind the best is no longer improved.
 _PATIENCE, _HOPELESS = 6, 500.0
 
@@ -145,8 +147,9 @@ def calibrate(
 ) -> Fits:
     """Levenberg-Marquardt over the first `rows` rows of every recording.
 
-    A lane has converged when an undamped step promises less than `tolerance` of minus twice the log posterior. The
-    values of effects do not move in lanes that are `held`.
+    A lane has converged when an undamped step promises less than `tolerance` of minus twice the log posterior; where
+    no step keeps what it promises, as about a threshold that passes a reading, less than `_SLIGHT`. The values of
+    effects do not move in lanes that are `held`.
     """
     problem, lanes = stepper.problem, len(start)
     weight = weights(problem, rows)
@@ -158,6 +161,7 @@ def calibrate(
         active[held, problem.slots :] = False
     fits = _evaluated(stepper, np.array(start, float), list(combinations), rows, weight)
     damping, done, stuck = np.full(lanes, 1e-3), np.zeros(lanes, bool), np.zeros(lanes, bool)
+    left = np.full(lanes, np.inf)
     fits = _costed(problem, fits, weight, precision, mean)
     for count in range(iterations):
         some = np.nonzero(~done)[0]  # lanes that have converged are not stepped again
@@ -166,7 +170,7 @@ def calibrate(
         mine = _chosen(fits, some)
         given = precision[some], mean[some], active[some], bounds[some], damping[some]
         step, promised = _steps(problem, mine, weight, *given)
-        done[some] = promised < tolerance
+        left[some], done[some] = promised, promised < tolerance
         if done.all():
             break
         some, mine, step = some[~done[some]], _chosen(mine, ~done[some]), step[~done[some]]
@@ -188,7 +192,7 @@ def calibrate(
             best = np.min(np.where(np.isnan(value), np.inf, value))
             stuck |= ~done & (value > best + 2 * _HOPELESS)
             done |= stuck
-    return replace(fits, converged=done & ~stuck & np.isfinite(fits.cost))
+    return replace(fits, converged=(done & ~stuck | (left < _SLIGHT)) & np.isfinite(fits.cost))
 
 
 def _chosen(fits: Fits, lanes: np.ndarray) -> Fits:
