@@ -266,9 +266,11 @@ class Answer:
     def _unexplained_location(self) -> dict[str, Any]:
         eq, several = self.problem.equations, len(self.lens) > 1
         # A nearly periodic remainder goes with the motion, so a force is likelier than an error of the sensor.
-        if self.before.kind == "coloured" and all(colour.damping >= 1 for colour in self.before.colours):
+        remembered = self.before.kind == "coloured" and all(colour.damping >= 1 for colour in self.before.colours)
+        if remembered or self.before.kind == "positional":
             kind, targets = "sensor", list(eq.columns)
-            where = "the readings are off in a way that remembers itself, without a name in the vocabulary"
+            way = "that remembers itself" if remembered else "that goes with what is read"
+            where = f"the readings are off in a way {way}, without a name in the vocabulary"
             windows = whole_windows(self.lens)
         else:
             strained = strained_coordinates(self.lens)

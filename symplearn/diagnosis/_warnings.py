@@ -12,6 +12,14 @@ from ._problem import Problem
 from ._weighed import Estimate
 
 
+# What is left beside the findings, by kind of remainder.
+_REMAINDERS = {
+    "coloured": "an error of the sensor",
+    "positional": "an error of the sensor that goes with what it reads",
+    "force": "a small missing force",
+}
+
+
 def warnings(
     problem: Problem,
     recordings: Sequence[Recording],
@@ -45,8 +53,7 @@ def warnings(
         if moved > 3:
             out.append(f"{name} moved {moved:.1f} of its prior standard deviations to fit the recording")
     if after.combination and after.kind != "white":
-        kind = "an error of the sensor" if after.kind == "coloured" else "a small missing force"
-        out.append(f"a remainder without a name is left beside the findings: {kind}")
+        out.append(f"a remainder without a name is left beside the findings: {_REMAINDERS[after.kind]}")
     if odds.tempered < 1:
         out.append(f"evidence was discounted by a factor of {1 / odds.tempered:.1f}: "
                    "the remainder is not white on the scale of the motion")  # fmt: skip

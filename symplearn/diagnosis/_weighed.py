@@ -1,6 +1,6 @@
 """One combination of effects with its evidence under each kind of remainder."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +14,7 @@ from ._strength import strength_gain
 from ._trajectory import Stepper
 
 # A remainder of the sensor is smaller than this share of what it reads; else it is the signal.
-_REMAINDER = 0.3
+REMAINDER = 0.3
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,9 @@ class Mode:
 class Estimate:
     """A combination fitted under one kind of remainder.
 
-    `kind` is `white` (no remainder), `coloured` (an error of the sensor with a memory) or `force` (a white missing
-    force of `intensity`). `noise` is the white sd of one original reading.
+    `kind` is `white` (no remainder), `coloured` (an error of the sensor with a memory), `positional` (one that goes
+    with what is read) or `force` (a white missing force of `intensity`). `noise` is the white sd of one original
+    reading, with the rms of a positional error.
     """
 
     combination: Combination
@@ -95,19 +96,25 @@ def weigh_coloured(problem: Problem, fits: Fits, priors: Priors, rows: list[int]
     for j in range(problem.channels):
         known = None if np.isnan(problem.noise[j]) else float(problem.noise[j])
         spread = float(np.nanstd(np.concatenate([rows_.readings[:, j] for rows_ in problem.rows])))
-        colours = fit_colour([x[..., j] for x in r], [w[:, j] for w in weight], times, known, _REMAINDER * spread)
+        colours = fit_colour([x[..., j] for x in r], [w[:, j] for w in weight], times, known, REMAINDER * spread)
         chosen.append(colours)
         for k in range(len(times)):
             gram, log = _channel_gram(problem, fits, r[k][..., j], weight[k][:, j], times[k], colours, k, j)
             grams[:, j] += gram
             logs[:, j] += log
     number = sum((w > 0).sum(0) for w in weight)
-    trusting = [b for b in range(lanes) if np.array_equal(problem.noise_of(fits.combinations[b]), problem.noise,
-                                                          equal_nan=True)]  # fmt: skip
-    return [
-        _coloured_estimate(problem, fits, b, grams[b], logs[b], number, tuple(c[b] for c in chosen), priors)
-        for b in trusting
-    ]
+    out = []
+    for b in trusting(problem, fits):
+        mine = tuple(c[b] for c in chosen)
+        one = correlated(problem, fits, b, grams[b], logs[b], number, sum(c.occam for c in mine), priors)
+        out.append(replace(one, kind="coloured", colours=mine))
+    return out
+
+
+def trusting(problem: Problem, fits: Fits) -> list[int]:
+    """Lanes that take a given noise as it is given."""
+    return [b for b, c in enumerate(fits.combinations)
+            if np.array_equal(problem.noise_of(c), problem.noise, equal_nan=True)]  # fmt: skip
 
 
 def _channel_gram(problem, fits: Fits, residual, weight, times, colours: list[Colour], recording: int, channel: int):
@@ -120,10 +127,14 @@ def _channel_gram(problem, fits: Fits, residual, weight, times, colours: list[Co
     return full, log
 
 
-def _coloured_estimate(
-    problem, fits: Fits, b: int, grams, logs, number, colours: tuple[Colour, ...], priors: Priors
-) -> Estimate:
-    """Integrate the unknowns with each channel's white noise at its best value, found by alternation."""
+def correlated(
+    problem: Problem, fits: Fits, b: int, grams, logs, number: np.ndarray, occam: float, priors: Priors
+) -> Estimate:  # fmt: skip
+    """Integrate the unknowns with each channel's white noise at its best value, found by alternation.
+
+    **Arguments:** - `grams`, `logs`: of each channel's whitened columns, in units of its white noise. - `occam`: what
+    the choice of the correlations owes.
+    """
     combination, noise = fits.combinations[b], fits.noise[b].copy()
     free = np.isnan(problem.noise)
     for _ in range(6):
@@ -134,10 +145,8 @@ def _coloured_estimate(
         square = np.einsum("i,jik,k->j", column, grams, column)
         noise = np.where(free, np.sqrt(np.maximum(square, 1e-300) / np.maximum(number, 1)), noise)
     z = fits.z[b] + one.step
-    value = _earned(one, fits, b) + sum(colour.occam for colour in colours)
-    value += strength_gain(problem, combination, priors, z, one.covariance)
-    return Estimate(combination, "coloured", z, one.covariance, noise, value, bool(fits.converged[b]),
-                    colours=colours)  # fmt: skip
+    value = _earned(one, fits, b) + occam + strength_gain(problem, combination, priors, z, one.covariance)
+    return Estimate(combination, "", z, one.covariance, noise, value, bool(fits.converged[b]))
 
 
 def _earned(one: Laplace, fits: Fits, lane: int) -> float:

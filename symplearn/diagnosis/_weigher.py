@@ -10,6 +10,7 @@ from ._along import along, readings
 from ._calibrate import Fits, Priors, grow, residuals, weights
 from ._found import Found
 from ._noisy import PathFit, fit_paths
+from ._positional import weigh_positional
 from ._problem import MOST, Combination, Problem
 from ._scatter import outlier_evidence, outliers, suspects
 from ._score import Start
@@ -127,7 +128,8 @@ class Weigher:
         fits = grow(self.stepper, z, candidates, priors, growing, held=held)
         for b, estimate in enumerate(weigh_white(self.problem, fits, priors, self.rows)):
             self._add(estimate, *self._outliers(fits, b))
-        for estimate in weigh_coloured(self.problem, fits, priors, self.rows):
+        correlated = weigh_coloured(self.problem, fits, priors, self.rows)
+        for estimate in correlated + weigh_positional(self.problem, fits, priors, self.rows):
             white = self.found.of(estimate.combination, "white")
             self._add(estimate, self.owed[estimate.combination], white.outliers if white else ())
 

@@ -1,0 +1,111 @@
+"""A remainder in the sensor that goes with what it reads: a scale that is not straight, an axis off its centre.
+
+Such an error repeats with the motion, and its harmonics look like forces at twice and four times the frequency. It is a
+random function of the reading: Legendre polynomials from the second degree on, since a bias and a gain have names of
+their own, with independent coefficients of one variance. As they enter in proportion, they are integrated out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy.polynomial.legendre import legvander
+
+from ._calibrate import Fits, Priors, residuals, weights
+from ._evidence import variance_inflation
+from ._problem import Problem
+from ._weighed import REMAINDER, Estimate, correlated, trusting
+
+# Polynomials up to this degree, and variances of the error against the noise's that are tried.
+_DEGREE = 12
+_RATIOS = np.geomspace(0.03, 1e4, 12)
+
+
+@dataclass(frozen=True, eq=False)
+class _Channel:
+    """Columns [error, slopes, polynomials] of one channel, all recordings end to end, in units of one reading."""
+
+    columns: Float[np.ndarray, "column row"]
+    plain: int  # columns that are no polynomials
+    number: int  # readings
+    log_weights: float
+
+    def marginal(self, ratio: float) -> tuple[np.ndarray, float]:
+        """Gram matrix of the plain columns with the polynomials integrated out, and the log determinant they leave."""
+        gram = self.columns @ self.columns.T
+        first, rest = slice(None, self.plain), slice(self.plain, None)
+        held = gram[rest, rest] + np.eye(len(gram) - self.plain) * (len(gram) - self.plain) / ratio
+        taken = gram[first, rest] @ np.linalg.solve(held, gram[rest, first])
+        sign = np.linalg.slogdet(held * ratio / (len(gram) - self.plain))[1]
+        return gram[first, first] - taken, float(sign) - self.log_weights
+
+    def cleared(self, ratio: float) -> Float[np.ndarray, "column row"]:
+        """The plain columns without what the polynomials take of them."""
+        rest = self.columns[self.plain :]
+        held = rest @ rest.T + np.eye(len(rest)) * len(rest) / ratio
+        plain = self.columns[: self.plain]
+        return plain - (plain @ rest.T) @ np.linalg.solve(held, rest)
+
+
+def weigh_positional(problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int]) -> list[Estimate]:
+    """Estimates where each channel's error goes with what it reads, about the trajectory fit.
+
+    None for a combination with a wrongly given noise, which such an error would only blur.
+    """
+    out = []
+    for b in trusting(problem, fits):
+        channels = [_channel(problem, fits, b, rows, j) for j in range(problem.channels)]
+        ratios, occam = zip(*(_ratio(problem, one, j) for j, one in enumerate(channels)), strict=True)
+        both = [one.marginal(ratio) for one, ratio in zip(channels, ratios, strict=True)]
+        grams, logs = np.stack([gram for gram, _ in both]), np.array([log for _, log in both])
+        number = np.array([one.number for one in channels])
+        one = correlated(problem, fits, b, grams, logs, number, sum(occam), priors)
+        out.append(_told(one, fits.z[b], channels, ratios, number))
+    return out
+
+
+def _channel(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int) -> _Channel:
+    weight = weights(problem, rows)
+    expected = np.concatenate([p.readings[b, :, j] for p in fits.predictions])
+    seen = np.concatenate([w[:, j] > 0 for w in weight])
+    low, high = expected[seen].min(initial=0.0), expected[seen].max(initial=1.0)
+    place = np.clip(2 * (expected - low) / max(high - low, 1e-300) - 1, -1.0, 1.0)
+    shapes = legvander(np.nan_to_num(place), _DEGREE)[:, 2:] * np.sqrt(2 * np.arange(2, _DEGREE + 1) + 1)
+    parts = []
+    for r, (x, w) in enumerate(zip(residuals(problem, fits.predictions, weight), weight, strict=True)):
+        slopes = np.zeros((problem.size, len(w)))
+        slopes[problem.local(r)] = fits.predictions[r].slopes[b, :, :, j]
+        parts.append(np.concatenate([x[b, None, :, j], slopes]))
+    root = np.sqrt(np.concatenate([w[:, j] for w in weight]))
+    columns = np.where(seen, np.concatenate([np.concatenate(parts, axis=1), shapes.T]), 0.0) * root
+    return _Channel(columns, 1 + problem.size, int(seen.sum()), float(2 * np.log(root[seen]).sum()))
+
+
+def _ratio(problem: Problem, one: _Channel, j: int) -> tuple[float, float]:
+    """The likeliest variance of the error against the noise's, and what its choice owes."""
+    known, values = problem.noise[j], []
+    spread = float(np.nanstd(np.concatenate([r.readings[:, j] for r in problem.rows])))
+    bare = replace(one, columns=np.concatenate([one.columns[:1], one.columns[one.plain :]]), plain=1)
+    for ratio in _RATIOS:
+        gram, log = bare.marginal(ratio)
+        square = float(gram[0, 0])
+        white = square / max(one.number, 1) if np.isnan(known) else float(known) ** 2
+        value = -0.5 * (one.number * np.log(max(white, 1e-300)) + square / max(white, 1e-300) + log)
+        values.append(value if ratio * white <= (REMAINDER * spread) ** 2 else -np.inf)
+    best = int(np.argmax(values))
+    if not np.isfinite(values[best]):
+        return float(_RATIOS[0]), -np.inf
+    return float(_RATIOS[best]), float(np.log(np.mean(np.exp(np.array(values) - values[best]))))
+
+
+def _told(
+    one: Estimate, begin: np.ndarray, channels: Sequence[_Channel], ratios: Sequence[float], number: np.ndarray
+) -> Estimate:
+    """With the noise that the error adds to, and how far from white the scores are that it leaves."""
+    column = np.concatenate([[1.0], begin - one.z])
+    errors = np.array([((column @ c.columns[: c.plain]) ** 2).sum() for c in channels])
+    total = np.sqrt(np.maximum(errors / np.maximum(number, 1), one.noise**2))
+    cleared = [c.cleared(ratio) for c, ratio in zip(channels, ratios, strict=True)]
+    scores = sum(x[1:] * (column @ x) / noise**2 for x, noise in zip(cleared, one.noise, strict=True))
+    return replace(one, kind="positional", noise=total, inflation=variance_inflation(scores.T))
