@@ -11,7 +11,6 @@ from ._posterior import Posterior
 from ._problem import Problem
 from ._weighed import Estimate
 
-
 # What is left beside the findings, by kind of remainder.
 _REMAINDERS = {
     "coloured": "an error of the sensor",
