@@ -16,11 +16,17 @@ from symplearn._errors import InputError, printable
 
 
 class Run(NamedTuple):
-    """One run of an experiment: the folder `out` that it fills, the `seed` of its noise, and whether it is `quick`."""
+    """One run of an experiment: the folder `out` that it fills, the `seed` of its noise, and whether it is `quick`.
+
+    `scheduler` is the address of a Dask scheduler whose workers do the parts of a sweep, or None; `looking` asks for
+    what is there already, and to make nothing.
+    """
 
     out: Path
     seed: int = 0
     quick: bool = False
+    scheduler: str | None = None
+    looking: bool = False
 
     def each(self, what: str, items: Collection[Any]) -> Iterator[Any]:
         """The items one by one, with a line on stderr after two seconds and then every ten."""
@@ -49,23 +55,42 @@ class Run(NamedTuple):
             unfinished.unlink(missing_ok=True)
 
 
+SCHEDULER = "work on the workers of this Dask scheduler, as tcp://HOST:8786 (default: in this process)"
+
+
+def in_double_precision() -> None:
+    """Double precision, and compiled programs kept beside the experiments."""
+    jax.config.update("jax_enable_x64", True)
+    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
+        jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / ".cache" / "jax"))
+
+
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {printable(message)}; `--help` tells what can be given\n")
 
 
-def command(name: str, about: str, experiment: Callable[[Run], None], arguments: Sequence[str] | None = None) -> None:
-    """Run an experiment in double precision with the command line's options; bad input is one sentence, exit 2."""
+def command(
+    name: str,
+    about: str,
+    experiment: Callable[[Run], None],
+    arguments: Sequence[str] | None = None,
+    sweep: bool = False,
+) -> None:
+    """Run an experiment in double precision with the command line's options; bad input is one sentence, exit 2.
+
+    A `sweep` takes `--scheduler`.
+    """
     parser = _Parser(prog=f"experiments.{name}", description=about)
     parser.add_argument("--out", type=Path, default=Path("out") / name, help="folder to fill (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the noise, 0 or more (default: 0)")
     parser.add_argument("--quick", action="store_true", help="a smaller run, of less than five minutes")
+    if sweep:
+        parser.add_argument("--scheduler", metavar="ADDRESS", help=SCHEDULER)
     run = Run(**vars(parser.parse_args(arguments)))
     if run.seed < 0:
         parser.error(f"--seed is {run.seed}, but must be 0 or more")
-    jax.config.update("jax_enable_x64", True)
-    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / ".cache" / "jax"))
+    in_double_precision()
     try:
         run.out.mkdir(parents=True, exist_ok=True)
         experiment(run)

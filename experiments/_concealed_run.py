@@ -4,17 +4,18 @@ import csv
 import hashlib
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+
+from symplearn._places import AbstractPlace
 
 from ._concealed_seal import put
 
@@ -32,7 +33,7 @@ def command_line() -> list[str]:
 
 def fingerprint(case: Path) -> str:
     """Of the public files; a kept diagnosis of other files is made anew."""
-    return hashlib.sha256(b"".join((case / name).read_bytes() for name in PUBLIC)).hexdigest()
+    return hashlib.sha256(b"".join(public(case).values())).hexdigest()
 
 
 def horizon(recording: Path) -> tuple[float, float]:
@@ -49,16 +50,29 @@ def horizon(recording: Path) -> tuple[float, float]:
 def diagnosed(case: Path, kept: Path, jobs: int, fresh: bool = False) -> dict[str, Any]:
     """What the diagnosis of a case said: from its file, or from a new process."""
     mark = fingerprint(case)
-    if kept.exists() and not fresh:
-        found = json.loads(kept.read_text(encoding="utf-8"))
-        if found["files"] == mark:
-            return found
-    with tempfile.TemporaryDirectory(prefix="concealed-") as folder:
-        for name in PUBLIC:
-            shutil.copyfile(case / name, Path(folder) / name)
-        found = _run(Path(folder), jobs) | {"files": mark}
+    if not fresh and (found := _kept(kept, mark)):
+        return found
+    found = apart(public(case), jobs) | {"files": mark}
     put(kept, json.dumps(found).encode())
     return found
+
+
+def public(case: Path) -> dict[str, bytes]:
+    """The two files of a case."""
+    return {name: (case / name).read_bytes() for name in PUBLIC}
+
+
+def apart(files: Mapping[str, bytes], jobs: int) -> dict[str, Any]:
+    """What a new process, of so many threads, says of a fresh folder with these files."""
+    with tempfile.TemporaryDirectory(prefix="concealed-") as folder:
+        for name in PUBLIC:
+            (Path(folder) / name).write_bytes(files[name])
+        return _run(Path(folder), jobs)
+
+
+def _kept(path: Path, mark: str) -> dict[str, Any] | None:
+    found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+    return found if found and found["files"] == mark else None
 
 
 def _run(folder: Path, jobs: int) -> dict[str, Any]:
@@ -135,3 +149,24 @@ def every(
                 _kill(process)
             raise
     return [found[case.name] for case in cases]
+
+
+def every_at(
+    place: AbstractPlace, cases: Sequence[Path], folder: Path, fresh: bool, tell: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """All cases on the workers of a cluster, a core each. One whose workers died is not kept, and counts as crashed."""
+    marks = {case: fingerprint(case) for case in cases}
+    found = {case: None if fresh else _kept(folder / f"{case.name}.json", marks[case]) for case in cases}
+    missing = [case for case in cases if found[case] is None]
+    begun = time.monotonic()
+    for k, outcome in enumerate(place.outcomes(apart, [(public(case), 1) for case in missing]), 1):
+        case = missing[outcome.number]
+        if outcome.failure is None:
+            found[case] = outcome.value | {"files": marks[case]}
+            put(folder / f"{case.name}.json", json.dumps(found[case]).encode())
+        else:
+            lost = {"status": "crashed", "seconds": 0.0, "document": None, "forecast": None}
+            found[case] = lost | {"told": outcome.failure, "files": marks[case]}
+        went = time.monotonic() - begun
+        tell(f"diagnosed {k} of {len(missing)} ({case.name}: {found[case]['status']}), {went:.0f} s")
+    return [found[case] for case in cases]

@@ -40,6 +40,10 @@ class Deadline:
     def __init__(self, moment: float = math.inf):
         self.moment = moment
 
+    def left(self) -> float:
+        """Seconds until then."""
+        return self.moment - time.monotonic()
+
 
 def side_by_side(jobs: Sequence[Callable[[], Any]], deadline: Deadline) -> list[Any]:
     """The results of the jobs: two at a time on a processor, for a program of small matrices keeps one core busy."""
@@ -138,7 +142,12 @@ def smaller(settings: Any, full: Any, **counts: tuple[int, int]) -> str:
 
 
 def study_command(
-    name: str, about: str, experiment: Callable[[Any, Deadline, Run], None], sizes: Callable[[bool], Any], given: Any
+    name: str,
+    about: str,
+    experiment: Callable[[Any, Deadline, Run], None],
+    sizes: Callable[[bool], Any],
+    given: Any,
+    sweep: bool = False,
 ) -> None:
     """The command line of a study: `sizes(quick)` are its settings, `given` the arguments, or None for the process's.
 
@@ -154,7 +163,7 @@ def study_command(
             raise SystemExit(130) from None
 
     more = "--minutes M stops in time; --width, --epochs and --repeats make it smaller."
-    command(name, f"{about} {more}", chosen, others)
+    command(name, f"{about} {more}", chosen, others, sweep)
 
 
 # The rates fall 20 times, so there are at least so many epochs.

@@ -3,11 +3,17 @@
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from ._cluster import elsewhere
 from ._command import Run, print_table
+
+
+class NotKept(Exception):
+    """A realisation has no file yet."""
 
 
 def kept(run: Run, name: str, k: int, settings: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -18,6 +24,8 @@ def kept(run: Run, name: str, k: int, settings: str, make: Callable[[], dict[str
         found = json.loads(path.read_text(encoding="utf-8"))
         if found.get("settings") == settings:
             return found
+    if run.looking:
+        raise NotKept
     found = make() | {"settings": settings}
     path.parent.mkdir(exist_ok=True)
     unfinished = path.with_suffix(".part")
@@ -26,10 +34,32 @@ def kept(run: Run, name: str, k: int, settings: str, make: Callable[[], dict[str
     return found
 
 
-def two_at_a_time(jobs: Sequence[Callable[[], dict[str, Any]]]) -> Iterator[dict[str, Any]]:
-    """What the jobs give, in order. A program of small matrices keeps one core busy. Neighbours should be of different
-    kinds, so that nothing is compiled twice."""
-    with ThreadPoolExecutor(2) as pool:
+def realisations(run: Run, jobs: Sequence[Callable[[Run], dict[str, Any]]], threads: int = 2) -> Iterator[Any]:
+    """What the jobs give, in order, each of which is `kept`: in this process, or by the workers of a Dask scheduler."""
+    if run.scheduler is None and threads == 1:
+        yield from (job(run) for job in jobs)
+        return
+    if run.scheduler is None:
+        yield from _side_by_side([partial(job, run) for job in jobs], threads)
+        return
+    missing = [job for job in jobs if not _is_kept(run, job)]
+    for _ in elsewhere(run, missing):
+        pass
+    yield from (job(run) for job in jobs)
+
+
+def _is_kept(run: Run, job: Callable[[Run], dict[str, Any]]) -> bool:
+    try:
+        job(run._replace(looking=True))
+    except NotKept:
+        return False
+    return True
+
+
+def _side_by_side(jobs: Sequence[Callable[[], dict[str, Any]]], threads: int) -> Iterator[dict[str, Any]]:
+    """A program of small matrices keeps one core busy. Neighbours should be of different kinds, so that nothing is
+    compiled twice."""
+    with ThreadPoolExecutor(threads) as pool:
         waiting = [pool.submit(job) for job in jobs]
         try:
             for one in waiting:

@@ -14,6 +14,7 @@ hold the true motion, which is SciPy's. Each batch of simulations and each repea
 stopped goes on where it was.
 """
 
+import importlib
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -27,7 +28,7 @@ from ._calibration_ranks import RANKED, batch_of, joined
 from ._calibration_results import coverage_metrics, rank_metrics, report, stretches
 from ._calibration_systems import system_called
 from ._command import Run, command
-from ._realisations import kept, two_at_a_time
+from ._realisations import kept, realisations
 
 BATCH = 50
 # Simulations of each model, quick and full.
@@ -67,7 +68,7 @@ def all_ranks(run: Run) -> dict[str, dict[str, Any]]:
     studies = STUDIES | WRONG
     todo = [(name, k) for k in range(SIMULATIONS[run.quick] // BATCH) for name in studies]
     batches: dict[str, list[dict[str, Any]]] = {name: [] for name in studies}
-    made = two_at_a_time([partial(batch, run, name, studies[name], k) for name, k in todo])
+    made = realisations(run, [partial(batch, name=name, study=studies[name], k=k) for name, k in todo])
     for (name, _), found in zip(run.each("batches", todo), made, strict=True):
         batches[name].append(found)
     return {name: joined(each) for name, each in batches.items()}
@@ -106,7 +107,7 @@ def all_repeats(run: Run) -> dict[str, list[dict[str, Any]]]:
     counts = {name: count for name, count in counts.items() if count}
     todo = [(name, k) for k in range(max(counts.values())) for name in counts if k < counts[name]]
     repeats: dict[str, list[dict[str, Any]]] = {name: [] for name in counts}
-    made = two_at_a_time([partial(repeat, run, name, k) for name, k in todo])
+    made = realisations(run, [partial(repeat, name=name, k=k) for name, k in todo])
     for (name, _), found in zip(run.each("repeats", todo), made, strict=True):
         repeats[name].append(found)
     return repeats
@@ -130,8 +131,10 @@ def draw(run: Run, studies: dict[str, dict[str, Any]], repeats: dict[str, list[d
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    command("calibration", "Calibration: simulation-based, and coverage of true motions.", experiment, arguments)
+    about = "Calibration: simulation-based, and coverage of true motions."
+    command("calibration", about, experiment, arguments, sweep=True)
 
 
 if __name__ == "__main__":
-    main()
+    # Under its own name, by which the workers of a cluster find it.
+    importlib.import_module("experiments.calibration").main()

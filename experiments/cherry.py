@@ -17,6 +17,7 @@ a draw stays with the MAP in the median: what the posterior itself expects of th
 Each noise realisation leaves a file, and a run that was stopped goes on where it was.
 """
 
+import importlib
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -58,7 +59,7 @@ from ._cherry_case import (
 from ._cherry_figures import draw
 from ._cherry_results import metrics, report
 from ._command import Run, command
-from ._realisations import kept, two_at_a_time
+from ._realisations import kept, realisations
 
 DRAWS = 50
 QUICK, FULL = 5, 20
@@ -212,7 +213,7 @@ def experiment(run: Run) -> None:
     """Every kind on every realisation, the metrics, the table and the figures."""
     todo = [(k, kind) for k in range(QUICK if run.quick else FULL) for kind in KINDS]
     results: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
-    made = two_at_a_time([partial(realisation, run, kind, k) for k, kind in todo])
+    made = realisations(run, [partial(realisation, kind=kind, k=k) for k, kind in todo])
     for (_, kind), found in zip(run.each("realisations", todo), made, strict=True):
         results[kind].append(found)
     found = metrics(results)
@@ -223,8 +224,10 @@ def experiment(run: Run) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    command("cherry", "Section 5.4.2: Tao's method against Runge-Kutta and least squares.", experiment, arguments)
+    about = "Section 5.4.2: Tao's method against Runge-Kutta and least squares."
+    command("cherry", about, experiment, arguments, sweep=True)
 
 
 if __name__ == "__main__":
-    main()
+    # Under its own name, by which the workers of a cluster find it.
+    importlib.import_module("experiments.cherry").main()

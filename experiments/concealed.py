@@ -1,6 +1,7 @@
 """The concealed trial: nature hides physics in recordings, seals the answers, and every diagnosis is scored.
 
     python -m experiments.concealed [--cases N] [--seed S] [--quick] [--out DIR] [--jobs N] [--no-oracle] [--no-today]
+                                    [--scheduler ADDRESS]
 
 Nature (`_concealed_nature.py`) draws systems, effects and ways of hiding them, verifies each hiding by computation, and
 writes two public files for each case; it shares no code with symplearn. The answers are sealed by SHA-256 before the
@@ -16,13 +17,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ._command import Run
+from symplearn._errors import InputError
+from symplearn._places import AbstractPlace, place
+
+from ._command import SCHEDULER, Run
 from ._concealed_figures import confusion, reliability, strength
 from ._concealed_files import answer, recording_file, simulation_file
 from ._concealed_nature import drawn
 from ._concealed_plan import Plan, plan
 from ._concealed_results import metrics, report, table_of_cases
-from ._concealed_run import PUBLIC, every
+from ._concealed_run import PUBLIC, every, every_at
 from ._concealed_score import row
 from ._concealed_seal import BrokenSeal, canonical, opened, put, seal
 from ._concealed_workers import cores, each, tell
@@ -80,13 +84,22 @@ def experiment(given: argparse.Namespace) -> None:
     """Draw, seal, diagnose, score."""
     out, cases = given.out, given.cases or (QUICK if given.quick else FULL)
     settings = {"cases": cases, "seed": given.seed, "version": VERSION}
-    _begun(out, settings)
+    with place(given.scheduler, tell) as workers:
+        _begun(out, settings)
+        _trial(given, workers, settings)
+
+
+def _trial(given: argparse.Namespace, workers: AbstractPlace, settings: dict[str, Any]) -> None:
+    out, cases = given.out, settings["cases"]
     names = draw(out, cases, given.seed)
     sealed(out, names, settings)
     if given.draw_only:
         return
     folders = [out / "public" / name for name in names]
-    results = every(folders, out / "diagnosed", given.jobs, given.fresh, tell)
+    if given.scheduler is None:
+        results = every(folders, out / "diagnosed", given.jobs, given.fresh, tell)
+    else:
+        results = every_at(workers, folders, out / "diagnosed", given.fresh, tell)
     rows = scored(out, names, results, not given.no_oracle)
     _shown(Run(out, given.seed, given.quick), names, rows, not given.no_today)
 
@@ -127,6 +140,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--cases", type=int, help=f"number of cases, 4 or more ({FULL}, quick: {QUICK})")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK} cases: under 20 minutes on two cores")
     parser.add_argument("--jobs", type=int, default=1, help="diagnoses side by side (1, which uses every core)")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help=SCHEDULER)
     parser.add_argument("--fresh", action="store_true", help="diagnose again what was diagnosed before")
     parser.add_argument("--draw-only", action="store_true", help="draw and seal the cases, and stop")
     parser.add_argument("--no-oracle", action="store_true", help="score without the oracle's fits")
@@ -149,7 +163,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     signal.signal(signal.SIGTERM, _stop)
     try:
         experiment(given)
-    except (BrokenSeal, OSError) as error:
+    except (BrokenSeal, InputError, OSError) as error:
         parser.exit(2, f"{parser.prog}: {error}\n")
     except KeyboardInterrupt:
         parser.exit(130, f"{parser.prog}: stopped; the same command goes on from here\n")

@@ -13,7 +13,9 @@ median of the draws' predictions, and `expected` is how long a draw stays with t
 itself expects of the MAP.
 """
 
+import importlib
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -45,7 +47,7 @@ from ._henon_heiles_case import (
 )
 from ._henon_heiles_figures import View, hamiltonians, phases, spreads, trajectories, variances
 from ._henon_heiles_results import PUBLISHED, metrics, report
-from ._realisations import kept
+from ._realisations import kept, realisations
 
 DRAWS = 200
 QUICK, FULL = 5, 20
@@ -153,8 +155,9 @@ def experiment(run: Run) -> None:
     """Every propagator on every realisation, the metrics, the table and the figures."""
     todo = [(k, name) for k in range(QUICK if run.quick else FULL) for name in PROPAGATORS]
     results: dict[str, list[dict[str, Any]]] = {name: [] for name in PROPAGATORS}
-    for k, name in run.each("realisations", todo):
-        results[name].append(realisation(run, name, k))
+    made = realisations(run, [partial(realisation, propagator=name, k=k) for k, name in todo], threads=1)
+    for (_, name), one in zip(run.each("realisations", todo), made, strict=True):
+        results[name].append(one)
     found = metrics(results)
     run.write(found)
     _draw(run, results)
@@ -190,8 +193,9 @@ def _view(name: str, one: dict[str, Any], times: np.ndarray) -> View:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    command("henon_heiles", "Section 5.4.1: leapfrog against Runge-Kutta.", experiment, arguments)
+    command("henon_heiles", "Section 5.4.1: leapfrog against Runge-Kutta.", experiment, arguments, sweep=True)
 
 
 if __name__ == "__main__":
-    main()
+    # Under its own name, by which the workers of a cluster find it.
+    importlib.import_module("experiments.henon_heiles").main()

@@ -12,6 +12,7 @@ of data sets whose likelihood bounds a variance on both sides: the others cannot
 A file is left for each data set, and a run that was stopped goes on where it was.
 """
 
+import importlib
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -28,7 +29,7 @@ from symplearn._profile_likelihood import profile_likelihood
 
 from ._command import Run, command, print_table
 from ._noise_zoo import ZOO, Problem
-from ._realisations import kept, spread, two_at_a_time
+from ._realisations import kept, realisations, spread
 
 DECADES, NEAR = 6.0, 0.5
 SETS, STARTS = {True: 2, False: 5}, {True: 2, False: 20}
@@ -159,7 +160,7 @@ def experiment(run: Run) -> None:
     results: dict[str, list[dict[str, Any]]] = {name: [] for name in ZOO}
     # The longest first.
     todo = [(k, name) for k in range(SETS[run.quick]) for name in reversed(ZOO)]
-    made = two_at_a_time([partial(data_set, run, name, k) for k, name in todo])
+    made = realisations(run, [partial(data_set, name=name, k=k) for k, name in todo])
     for (_, name), one in zip(run.each("data sets", todo), made, strict=True):
         results[name].append(one)
     found = metrics(results)
@@ -170,8 +171,9 @@ def experiment(run: Run) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    command("noise_starts", "Noise levels found from starts six decades off.", experiment, arguments)
+    command("noise_starts", "Noise levels found from starts six decades off.", experiment, arguments, sweep=True)
 
 
 if __name__ == "__main__":
-    main()
+    # Under its own name, by which the workers of a cluster find it.
+    importlib.import_module("experiments.noise_starts").main()

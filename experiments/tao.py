@@ -1,18 +1,22 @@
 """A network learns the Hamiltonian of Tao's example by likelihood and by L1. Dissertation 5.4.3, Figures 5.8 to 5.11.
 
     python -m experiments.tao [--quick] [--out DIR] [--seed N] [--minutes M] [--width W] [--epochs E] [--repeats R]
+                              [--scheduler ADDRESS]
 
 88 data sets (a, n) of H = (q^2 + 1)(p^2 + 1) / 2 with noise v ~ U[1 - a, 1 + a] times each of n readings, 20 repeats of
 each: new weights, batches and noise, the same for both objectives. Truth by SciPy's DOP853. All rows of one n are one
 program; on a GPU the likelihood of all n is. `--minutes` stops in time; the same command again goes on from there.
+With `--scheduler` the workers of a Dask cluster train, one n each.
 
 Beyond the dissertation: the same likelihood with the mean of Tao's two copies in the filter, not the first copy, which
 is nearly symplectic (specification E40), at the corners and the centre of the grid; and the likelihood on data with ten
 times the noise of those given to L1.
 """
 
+import importlib
 import itertools
 import math
+import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -39,6 +43,7 @@ from symplearn._prior import Flat, HalfNormal, Prior
 from symplearn._train import Training
 
 from . import _tao_results as found
+from ._cluster import elsewhere
 from ._command import Run
 from ._ensemble import Deadline, Ensemble, Weighted, plain, side_by_side, smaller, study_command
 from ._tao_results import COUNTS, L1, MEAN, NOISES, POSTERIOR, WAYS, Cell, Judged
@@ -187,6 +192,9 @@ def study(settings: Settings, run: Run, deadline: Deadline) -> Results:
     folder = run.out / "parts"
     folder.mkdir(exist_ok=True)
     seal = f"{settings} {run.seed}"
+    if run.scheduler is not None:
+        _on_cluster(settings, run, deadline)
+        return _finished(settings, folder, seal)
     groups = [settings.counts] if jax.default_backend() == "gpu" else [[n] for n in settings.counts]
 
     def done(group: list[int]) -> bool:
@@ -195,9 +203,34 @@ def study(settings: Settings, run: Run, deadline: Deadline) -> Results:
 
     # The longest first, so that both cores are busy to the end.
     groups.reverse()
-    finished = side_by_side([partial(done, group) for group in groups], deadline)
-    counts = sorted(n for group, ended in zip(groups, finished, strict=True) if ended for n in group)
-    return {n: Checkpoint(folder / f"n_{n}.npz", seal).load(_blank(settings, n)) for n in counts}
+    side_by_side([partial(done, group) for group in groups], deadline)
+    return _finished(settings, folder, seal)
+
+
+def _finished(settings: Settings, folder: Path, seal: str) -> Results:
+    """What is trained and judged at each n."""
+    files = {n: folder / f"n_{n}.npz" for n in settings.counts}
+    return {n: Checkpoint(file, seal).load(_blank(settings, n)) for n, file in files.items() if file.exists()}
+
+
+def _on_cluster(settings: Settings, run: Run, deadline: Deadline) -> None:
+    """Every n that is not done is a part of its own, the longest first; what it has begun goes along and comes back."""
+    folder, until = run.out / "parts", time.time() + deadline.left()
+    counts = [n for n in reversed(settings.counts) if not (folder / f"n_{n}.npz").exists()]
+    begun = {n: sorted(folder.glob(f"{n}_*.npz")) for n in counts}
+    sent = [{f"parts/{path.name}": path.read_bytes() for path in begun[n]} for n in counts]
+    for n in elsewhere(run, [partial(_part, settings, n, until) for n in counts], sent):
+        for path in begun[n] if (folder / f"n_{n}.npz").exists() else ():
+            path.unlink(missing_ok=True)
+
+
+def _part(settings: Settings, n: int, until: float, run: Run) -> int:
+    """Train and judge all rows of one n, until a moment of `time.time` at most; n."""
+    folder = run.out / "parts"
+    folder.mkdir(exist_ok=True)
+    deadline = Deadline(time.monotonic() + until - time.time())
+    _train(settings, [n], run.seed, folder, f"{settings} {run.seed}", deadline)
+    return n
 
 
 def _blank(settings: Settings, n: int) -> dict[str, Judged]:
@@ -258,8 +291,9 @@ def experiment(settings: Settings, deadline: Deadline, run: Run) -> None:
 def main(arguments: Sequence[str] | None = None, settings: Settings | None = None) -> None:
     """The command line; `settings` are others than those of the options."""
     about = "Learn Tao's example by likelihood and by L1."
-    study_command("tao", about, experiment, lambda quick: settings or (QUICK if quick else FULL), arguments)
+    study_command("tao", about, experiment, lambda quick: settings or (QUICK if quick else FULL), arguments, True)
 
 
 if __name__ == "__main__":
-    main()
+    # Under its own name, by which the workers of a cluster find it.
+    importlib.import_module("experiments.tao").main()
