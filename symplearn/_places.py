@@ -96,7 +96,7 @@ class Cluster(AbstractPlace):
         self._client.close()
 
     def outcomes(self, work: Callable[..., Any], cases: Sequence[tuple[Any, ...]]) -> Iterator[Outcome]:
-        waiting, running = deque(enumerate(cases)), {}
+        waiting, running = deque(enumerate(cases)), dict[Any, tuple[int, Any]]()
         try:
             while waiting or running:
                 # No more than are begun at once: what only waits at a worker would count as failed when that dies.
@@ -141,4 +141,5 @@ def place(scheduler: str | None, tell: Callable[[str], None] = lambda line: None
 
 
 def _in_words(error: Any) -> str:
-    return f"{type(error).__name__}: {printable(str(error))}"[:_LONGEST]
+    text = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {printable(str(error))}"
+    return text[:_LONGEST]

@@ -1,11 +1,8 @@
 """The `symplearn` command."""
 
-import atexit
 import os
-import shutil
 import signal
 import sys
-import tempfile
 import time
 from importlib import resources
 from pathlib import Path
@@ -17,6 +14,7 @@ from rich.console import Console
 from typer.exceptions import TyperException
 
 from ._errors import InputError, printable
+from ._private_cache import prepare
 
 app = typer.Typer(
     name="symplearn",
@@ -51,25 +49,17 @@ def diagnose(
     cache: Annotated[bool, typer.Option(help="Keep compiled programs under the user's cache folder.")] = True,
 ) -> None:
     """Locate what differs, name what was left out, and show the fit without and with it."""
-    if not 0 <= holdout < 1:
-        raise InputError(f"--holdout: is {holdout}; give a share from 0 up to, but not including, 1")
-    if time_limit is not None and not time_limit > 0:
-        raise InputError(f"--time-limit: is {time_limit}; give a positive number of seconds")
+    _check(holdout, time_limit)
     if forecast_step is not None and forecast_until is None:
         raise InputError("--forecast-step: needs --forecast-until; give the time to forecast to")
-    _prepare(cache)
-    from ._effects import EFFECTS
+    prepare(cache)
     from ._recording import read_recordings
     from ._simulation_file import read_simulation
-    from .diagnosis import Options, restriction_of
+    from .diagnosis import Options
     from .diagnosis import diagnose as run
     from .report import prepare_directory, summary, write_outputs
 
-    restriction = restriction_of(effects, sensor_only, dynamics_only)
-    sensors = {EFFECTS[name].family == "sensor" for name in restriction.effects or ()}
-    if sensors == {dynamics_only} and sensor_only != dynamics_only:
-        flag = "--sensor-only" if sensor_only else "--dynamics-only"
-        raise InputError(f"{flag}: leaves none of the --effects to search; drop one of the two")
+    restriction = _restriction(effects, sensor_only, dynamics_only)
     file = read_simulation(simulation)
     read = read_recordings(file, recordings)
     folder = prepare_directory(out)
@@ -94,6 +84,66 @@ def diagnose(
     console.print(summary(found, folder), soft_wrap=not console.is_terminal)
     if fail_on_mismatch and found.document["verdict"] != "consistent":
         raise typer.Exit(3)
+
+
+@app.command()
+def diagnose_each(
+    simulation: Annotated[Path, typer.Argument(help="The simulation file (TOML).", show_default=False)],
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings (CSV, .csv.gz).", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder of the reports, one folder each.")] = Path("diagnoses"),
+    seed: Annotated[int, typer.Option(min=-(2**63), max=2**63 - 1, help="Same seed, same files: same answer.")] = 0,
+    holdout: Annotated[float, typer.Option(help="Last part of each recording, kept from every fit.")] = 0.25,
+    effects: Annotated[str | None, typer.Option(help="Search these effects only (comma separated).")] = None,
+    sensor_only: Annotated[bool, typer.Option("--sensor-only", help="Search effects of the sensors only.")] = False,
+    dynamics_only: Annotated[
+        bool, typer.Option("--dynamics-only", help="Search effects of the dynamics only.")
+    ] = False,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Threads of a diagnosis (every core; 1 on workers).")] = None,
+    time_limit: Annotated[float | None, typer.Option(help="Cut each search short after these seconds.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Diagnose on the workers of this Dask scheduler.")
+    ] = None,
+    cache: Annotated[bool, typer.Option(help="Keep compiled programs under the user's cache folder.")] = True,
+) -> None:
+    """Diagnose every recording by itself, not all of them as one question; what is done is kept."""
+    _check(holdout, time_limit)
+    prepare(cache)
+    from . import _each_recording as each
+    from ._places import place
+    from ._simulation_file import read_simulation
+
+    threads = jobs or (_CORES if scheduler is None else 1)
+    limit = time_limit if time_limit is not None else float("inf")
+    settings = each.Settings(holdout, seed, _restriction(effects, sensor_only, dynamics_only), threads, limit, cache)
+    read_simulation(simulation)  # for all of them, what is wrong with it is said once
+    console, failed = Console(), 0
+    with place(scheduler, lambda line: print(line, file=sys.stderr)) as workers, _Progress() as progress:
+        for one in each.diagnose_each(workers, simulation, recordings, out, settings):
+            failed += one.failure is not None
+            said = "kept from before" if one.kept else one.verdict or f"failed: {one.failure}"
+            console.print(f"{printable(one.name)}: {said}", markup=False, highlight=False, soft_wrap=True)
+            progress.say(f"{printable(one.name)} is done")
+    if failed:
+        _leave(1, f"{failed} of {len(recordings)} recordings could not be diagnosed; the others' reports are in {out}")
+
+
+def _check(holdout: float, time_limit: float | None) -> None:
+    if not 0 <= holdout < 1:
+        raise InputError(f"--holdout: is {holdout}; give a share from 0 up to, but not including, 1")
+    if time_limit is not None and not time_limit > 0:
+        raise InputError(f"--time-limit: is {time_limit}; give a positive number of seconds")
+
+
+def _restriction(effects: str | None, sensor_only: bool, dynamics_only: bool) -> Any:
+    from ._effects import EFFECTS
+    from .diagnosis import restriction_of
+
+    restriction = restriction_of(effects, sensor_only, dynamics_only)
+    sensors = {EFFECTS[name].family == "sensor" for name in restriction.effects or ()}
+    if sensors == {dynamics_only} and sensor_only != dynamics_only:
+        flag = "--sensor-only" if sensor_only else "--dynamics-only"
+        raise InputError(f"{flag}: leaves none of the --effects to search; drop one of the two")
+    return restriction
 
 
 @app.command()
@@ -142,42 +192,6 @@ class _Progress:
             self._console.print(f"{passed:6.1f} s  {message}", markup=False, highlight=False)
 
 
-def _prepare(cache: bool) -> None:
-    """Double precision; compiled programs and the plots' font list in a private folder of the user's cache."""
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    folder = _private_folder() if cache else None
-    # Left to itself matplotlib keeps its font list in a folder of its own.
-    if "MPLCONFIGDIR" not in os.environ:
-        os.environ["MPLCONFIGDIR"] = str(folder / "matplotlib") if folder else _passing_folder()
-    jax.config.update("jax_enable_compilation_cache", cache)  # $JAX_COMPILATION_CACHE_DIR may name one, too
-    if folder is not None:
-        jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
-
-
-def _passing_folder() -> str:
-    """A folder that goes when the command ends."""
-    folder = tempfile.mkdtemp(prefix="symplearn-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
-
-
-def _private_folder() -> Path | None:
-    """The cache folder, readable by its owner alone; None where there can be none: what lies in it is executed."""
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "symplearn"
-    try:
-        for part in (folder, folder / "jax", folder / "matplotlib"):
-            part.mkdir(mode=0o700, parents=True, exist_ok=True)
-            if part.is_symlink() or part.stat().st_uid != os.getuid():
-                return None
-            part.chmod(0o700)
-    except OSError:
-        return None
-    return folder
-
-
 def main() -> None:
     """Run the command; wrong input is one line on stderr and exit code 2, a failure one line and exit code 1."""
     try:
@@ -193,7 +207,11 @@ def main() -> None:
             raise
         _leave(1, f"failed: {type(error).__name__}: {printable(str(error))[:500]}")
     if code == _STOPPED:
-        _leave(_STOPPED, "stopped; nothing was written")
+        each = sys.argv[1:2] == ["diagnose-each"]
+        _leave(
+            _STOPPED,
+            f"stopped; {'what is done is kept, and the same command goes on' if each else 'nothing was written'}",
+        )
     sys.exit(code)
 
 
