@@ -54,7 +54,7 @@ class Answer:
             self.posterior = posterior(self.problem, found, inflation)
             self.chosen, self.verdict = self._verdict()
         self.before: Estimate = self.posterior.nothing
-        self.after: Estimate = self.chosen.best if self.chosen else self.before
+        self.after: Estimate = found.shown(self.chosen.combination, self.chosen.best) if self.chosen else self.before
         # Shown before: the calibrated simulation as it is, which knows no missing force.
         plain = found.of((), "white") or self.before
         self.without = self._outlooks(plain, intensity_of(stepper, plain))
@@ -155,7 +155,14 @@ class Answer:
             "fit": {"before": before, "after": after},
             "next_measurement": self._next(),
             "warnings": warnings(
-                self.problem, self.recordings, self.found, self.posterior, self.after, self.without, self.with_
+                self.problem,
+                self.recordings,
+                self.found,
+                self.posterior,
+                self.chosen,
+                self.after,
+                self.without,
+                self.with_,
             ),
             "thinning": {
                 "rows": sum(r.given for r in self.problem.rows),

@@ -8,6 +8,7 @@ import numpy as np
 from .._effects import UNNAMED
 from .._recording import Recording
 from .._simulation_records import SimulationFile
+from ._ahead import look_ahead
 from ._build import augmented_equations, build, first_substep, refined, rows_fitted
 from ._found import Found
 from ._locate import strained_coordinates
@@ -54,7 +55,9 @@ def searched(
         if finer is not stepper.problem:
             options.progress("weighing the best combinations again in finer steps")
             found = search.again(Stepper(finer, options.jobs))
-    return _with_unnamed(file, recordings, options, search, found)
+    found, stepper = _with_unnamed(file, recordings, options, search, found)
+    look_ahead(search.stepper, found, search.rows)
+    return found, stepper
 
 
 def _with_unnamed(

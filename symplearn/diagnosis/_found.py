@@ -13,6 +13,15 @@ from ._weighed import Estimate, Mode
 _APART = 2.0
 
 
+@dataclass(frozen=True)
+class Ahead:
+    """How a combination predicts rows that a trajectory fit has not seen: a score in nats, at most zero, and whether
+    the fit errs there hardly more than where it was fitted."""
+
+    score: float
+    holds: bool
+
+
 @dataclass
 class Found:
     """Estimates by combination, one per kind of remainder; where the places of its effects have several optima, they
@@ -23,6 +32,7 @@ class Found:
     estimates: dict[Combination, list[Estimate]] = field(default_factory=dict)
     complete: bool = True
     choices: dict[int, float] = field(default_factory=dict)  # log of how many expressions a force was chosen from
+    ahead: dict[Combination, Ahead] = field(default_factory=dict)  # of the likeliest, beside a clear remainder
 
     def add(self, estimate: Estimate) -> None:
         """Keep an estimate beside those of the same combination and kind, as a mode where it stands apart."""
@@ -65,3 +75,12 @@ class Found:
     def best(self, combination: Combination) -> float:
         """The largest log evidence of a combination over kinds."""
         return max((e.log_evidence for e in self.estimates[combination]), default=-np.inf)
+
+    def shown(self, combination: Combination, best: Estimate) -> Estimate:
+        """The estimate to run on: where a clear remainder is left, the trajectory fit if that holds on ahead, as wide
+        as its errors are long-lived."""
+        white = self.of(combination, "white")
+        one = self.ahead.get(combination)
+        if one is None or not one.holds or white is None or not white.converged:
+            return best
+        return replace(white, covariance=white.covariance * white.inflation)

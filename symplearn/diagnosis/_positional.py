@@ -1,8 +1,8 @@
 """A remainder in the sensor that goes with what it reads: a scale that is not straight, an axis off its centre.
 
 Such an error repeats with the motion, and its harmonics look like forces at twice and four times the frequency. It is a
-random function of the reading: Legendre polynomials from the second degree on, since a bias and a gain have names of
-their own, with independent coefficients of one variance. As they enter in proportion, they are integrated out.
+random function of the reading: Legendre polynomials with independent coefficients of one variance, which enter in
+proportion and are integrated out. A bias or a gain alone has a name of its own, and fewer unknowns to pay for.
 """
 
 from collections.abc import Sequence
@@ -71,7 +71,7 @@ def _channel(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int) 
     seen = np.concatenate([w[:, j] > 0 for w in weight])
     low, high = expected[seen].min(initial=0.0), expected[seen].max(initial=1.0)
     place = np.clip(2 * (expected - low) / max(high - low, 1e-300) - 1, -1.0, 1.0)
-    shapes = legvander(np.nan_to_num(place), _DEGREE)[:, 2:] * np.sqrt(2 * np.arange(2, _DEGREE + 1) + 1)
+    shapes = legvander(np.nan_to_num(place), _DEGREE) * np.sqrt(2 * np.arange(_DEGREE + 1) + 1)
     parts = []
     for r, (x, w) in enumerate(zip(residuals(problem, fits.predictions, weight), weight, strict=True)):
         slopes = np.zeros((problem.size, len(w)))

@@ -29,7 +29,7 @@ class Weighed:
 
     combination: Combination
     probability: float
-    log_evidence: float  # over kinds of remainder, tempered, prior of the combination not included
+    log_evidence: float  # over kinds of remainder, tempered, prior of the combination not included; scores ahead added
     best: Estimate
 
 
@@ -65,12 +65,15 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     top = max(e.log_evidence for es in found.estimates.values() for e in es)
     if not np.isfinite(top):
         return Posterior(0.0, 1.0, (), 0.0, _speaker(found.estimates[()]), {(): -np.inf}, factor)
+    unseen = min((one.score for one in found.ahead.values() if np.isfinite(one.score)), default=0.0)
     white, other, named = -np.inf, -np.inf, []
     evidences: dict[Combination, float] = {}
     for combination, estimates in found.estimates.items():
         tempered = {e.kind: top + factor * (e.log_evidence - top) for e in estimates}
         plain = tempered.get("white", -np.inf)
         noisy = _mixture([tempered.get(kind, -np.inf) for kind in _REMAINDERS])
+        ahead = found.ahead[combination].score if combination in found.ahead else unseen
+        plain, noisy = plain + ahead, noisy + ahead
         total = float(np.logaddexp(plain, np.log(remainder) + noisy))
         evidences[combination] = total if combination else max(plain, noisy)
         if not combination:

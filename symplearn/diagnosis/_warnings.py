@@ -7,7 +7,7 @@ import numpy as np
 from .._recording import Recording
 from ._found import Found
 from ._outlook import Outlook
-from ._posterior import Posterior
+from ._posterior import Posterior, Weighed
 from ._problem import Problem
 from ._weighed import Estimate
 
@@ -24,6 +24,7 @@ def warnings(
     recordings: Sequence[Recording],
     found: Found,
     odds: Posterior,
+    chosen: Weighed | None,
     after: Estimate,
     without: Sequence[Outlook],
     with_: Sequence[Outlook],
@@ -51,8 +52,11 @@ def warnings(
         moved = abs(after.z[problem.head + j] - c.mean[j]) / c.sd[j]
         if moved > 3:
             out.append(f"{name} moved {moved:.1f} of its prior standard deviations to fit the recording")
-    if after.combination and after.kind != "white":
-        out.append(f"a remainder without a name is left beside the findings: {_REMAINDERS[after.kind]}")
+    if chosen is not None and chosen.best.kind != "white":
+        out.append(f"a remainder without a name is left beside the findings: {_REMAINDERS[chosen.best.kind]}")
+    if found.ahead:
+        out.append("the remainder is clear, so answers were also weighed by how well they predict rows that they were "
+                   "not fitted to")  # fmt: skip
     if odds.tempered < 1:
         out.append(f"evidence was discounted by a factor of {1 / odds.tempered:.1f}: "
                    "the remainder is not white on the scale of the motion")  # fmt: skip

@@ -1,0 +1,66 @@
+"""How well the likeliest answers predict ahead: leave-future-out scores, where a clear remainder has no name.
+
+Evidence then rests on a guess of what the remainder is, and Bayes factors of wrong models mislead. Every combination is
+fitted to the first part of the rows as a plain trajectory, and run on over the others (Buerkner, Gabry and Vehtari
+2020). Errors ahead are of one piece, an amplitude and a phase that drift away, so each free run counts as two readings.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from ._calibrate import calibrate, residuals, weights
+from ._found import Ahead, Found
+from ._problem import Combination
+from ._trajectory import LANES, Stepper
+
+# Nats by which a remainder stands above white noise, and by which an answer may lie behind the best to be looked at.
+_CLEAR, _REACH = 10.0, 100.0
+_MOST = 2 * LANES
+# Shares of the rows that are fitted, steps of each fit, and what one channel's free run counts for.
+_ORIGINS, _STEPS, _READINGS = (0.4, 0.6, 0.8), 20, 2.0
+# A trajectory fit that errs no more ahead than this many times as much as where it was fitted holds on.
+_HOLDS = 3.0
+
+
+def look_ahead(stepper: Stepper, found: Found, rows: Sequence[int]) -> None:
+    """Keep what the likeliest combinations score, where the best leaves a clear remainder; else nothing."""
+    ranked = sorted(found.estimates, key=found.best, reverse=True)
+    top = found.best(ranked[0])
+    white = found.of(ranked[0], "white")
+    if not np.isfinite(top) or white is None or top < white.log_evidence + _CLEAR:
+        return
+    near = [c for c in ranked if found.best(c) > top - _REACH and found.of(c, "white")]
+    bare = [c for c in found.estimates if c == () and c not in near[:_MOST]]
+    found.ahead = _scores(stepper, found, [*near[: _MOST - len(bare)], *bare], rows)
+
+
+def _scores(
+    stepper: Stepper, found: Found, combinations: list[Combination], rows: Sequence[int]
+) -> dict[Combination, Ahead]:
+    begin = np.stack([white.z for c in combinations if (white := found.of(c, "white"))])
+    total, holds = np.zeros(len(begin)), np.ones(len(begin), bool)
+    for share in _ORIGINS:
+        first = [max(1, round(n * share)) for n in rows]
+        fits = calibrate(stepper, begin, combinations, found.priors, first, _STEPS)
+        inside, ahead = _squares(stepper, fits.z, combinations, rows, first)
+        total -= 0.5 * _READINGS * np.log(ahead).sum(1)
+        holds &= (ahead < _HOLDS**2 * inside).all(1)
+    total = np.where(np.isfinite(total), total, -np.inf)
+    return {c: Ahead(float(t - total.max()), bool(h)) for c, t, h in zip(combinations, total, holds, strict=True)}
+
+
+def _squares(
+    stepper: Stepper, z: np.ndarray, combinations: Sequence[Combination], rows: Sequence[int], first: Sequence[int]
+) -> tuple[Float[np.ndarray, "lane channel"], Float[np.ndarray, "lane channel"]]:
+    """Mean squares of the errors up to each recording's first rows, and after them."""
+    weight = weights(stepper.problem, rows)
+    parts = residuals(stepper.problem, stepper.predict(z, combinations, rows), weight)
+    out = []
+    for later in (False, True):
+        cut = [slice(n, None) if later else slice(None, n) for n in first]
+        square = sum((w[s] * x[:, s] ** 2).sum(1) for x, w, s in zip(parts, weight, cut, strict=True))
+        number = sum((w[s] > 0).sum(0) for w, s in zip(weight, cut, strict=True))
+        out.append(np.where(number > 0, square / np.maximum(number, 1), 1.0))
+    return out[0], out[1]

@@ -1,0 +1,71 @@
+"""Beside a remainder without a name answers are weighed by what they predict, and only there."""
+
+from dataclasses import replace
+
+import engine_cases as cases
+import numpy as np
+import pytest
+
+from symplearn.diagnosis._ahead import look_ahead
+from symplearn.diagnosis._calibrate import calibrate
+from symplearn.diagnosis._found import Found
+from symplearn.diagnosis._start import priors_without_effects
+from symplearn.diagnosis._trajectory import Stepper
+from symplearn.diagnosis._weighed import weigh_coloured, weigh_white
+
+TIMES = np.linspace(0.0, 80.0, 500)
+ROWS = [len(TIMES)]
+
+
+def found_in(remainder):
+    """A spring with quadratic drag, weighed with nothing, with a damping and with the drag."""
+    rates = lambda t, x: [x[1], -x[0] - 0.02 * np.abs(x[1]) * x[1]]  # noqa: E731
+    y = cases.solved(rates, [1.0, 0.0], TIMES)[:, 0] + 0.005 * np.random.default_rng(1).normal(size=len(TIMES))
+    more = "[parameters]\nk = { value = 1.0, sd = 0.1 }\n"
+    p = cases.problem(cases.simulation("p**2/2 + k*q**2/2", more=more), [cases.recorded(TIMES, y + remainder)], 0.1)
+    bare = priors_without_effects(p)
+    priors = replace(bare, scales=np.full(p.equations.size, 0.3), precision=np.full(p.size, 1e-2))
+    names = [p.candidate(m).effect.name for m in p.searched]
+    combinations = [(), *((p.searched[names.index(name)],) for name in ("viscous_damping", "quadratic_drag"))]
+    begin = np.zeros((3, p.size))
+    begin[:, [0, p.head]] = 1.0
+    begin[1:, p.slots] = 0.01, 0.02
+    stepper, found = Stepper(p), Found(p, priors)
+    fits = calibrate(stepper, begin, combinations, priors, ROWS)
+    for estimate in weigh_white(p, fits, priors, ROWS) + weigh_coloured(p, fits, priors, ROWS):
+        found.add(estimate)
+    look_ahead(stepper, found, ROWS)
+    return found, combinations
+
+
+@pytest.fixture(scope="module")
+def clear():
+    """With an error of the sensor that swings slowly, by three times its noise."""
+    return found_in(0.01 * np.sin(0.37 * TIMES + 0.5) * np.cos(0.05 * TIMES))
+
+
+def test_what_predicts_is_ahead(clear):
+    """The true law scores best, the wrong one less, and nothing at all far less; the true one's trajectory holds."""
+    found, (nothing, damping, drag) = clear
+    score = {c: found.ahead[c].score for c in (nothing, damping, drag)}
+    assert score[drag] == 0.0 and found.ahead[drag].holds
+    assert score[damping] < -1.0 and score[nothing] < score[damping] - 5.0
+
+
+def test_the_trajectory_that_holds_is_shown(clear):
+    """Whatever kind of remainder speaks for it, the numbers shown are the trajectory fit's, wider by its errors' long
+    life; they cover the truth."""
+    found, (*_, drag) = clear
+    coloured, white = (found.of(drag, kind) for kind in ("coloured", "white"))
+    assert coloured.log_evidence > white.log_evidence + 10.0
+    shown = found.shown(drag, coloured)
+    place = found.problem.slots
+    assert shown.kind == "white" and shown.covariance[place, place] >= white.covariance[place, place]
+    assert shown.z[place] == pytest.approx(0.02, abs=3 * np.sqrt(shown.covariance[place, place]))
+
+
+def test_white_noise_needs_no_second_look():
+    """Where the best answer leaves nothing but noise, evidence alone counts, and the best estimate is shown."""
+    found, (*_, drag) = found_in(0.0)
+    assert found.ahead == {}
+    assert found.shown(drag, found.of(drag, "coloured")).kind == "coloured"

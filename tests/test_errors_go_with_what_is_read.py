@@ -1,0 +1,63 @@
+"""An error of the sensor that goes with what it reads is integrated out exactly, and is not taken for a force."""
+
+from dataclasses import replace
+
+import engine_cases as cases
+import numpy as np
+import pytest
+
+from symplearn.diagnosis._calibrate import calibrate
+from symplearn.diagnosis._positional import _Channel, weigh_positional
+from symplearn.diagnosis._start import priors_without_effects
+from symplearn.diagnosis._trajectory import Stepper
+from symplearn.diagnosis._weighed import weigh_coloured, weigh_white
+
+NOISE, TIMES = 0.01, np.linspace(0.0, 50.0, 400)
+
+
+@pytest.mark.parametrize("ratio", [0.05, 30.0])
+def test_polynomials_are_integrated_out(ratio):
+    """Gram matrix and determinant are those of the dense covariance that independent coefficients give the errors."""
+    rng = np.random.default_rng(1)
+    columns = rng.normal(size=(4 + 3, 50))
+    one = _Channel(columns, 4, 50, 0.7)
+    covariance = np.eye(50) + ratio / 3 * columns[4:].T @ columns[4:]
+    gram, log = one.marginal(ratio)
+    np.testing.assert_allclose(gram, columns[:4] @ np.linalg.solve(covariance, columns[:4].T), rtol=1e-9)
+    assert log == pytest.approx(np.linalg.slogdet(covariance)[1] - 0.7, rel=1e-12)
+    np.testing.assert_allclose(columns[:4] @ one.cleared(ratio).T, gram, rtol=1e-9)
+
+
+def evidences(scale):
+    """Log evidence of a spring, its stiffness calibrated, whose readings a sensor bends by `scale`, by remainder."""
+    rates = lambda t, x: [x[1], -x[0] - 0.01 * x[1]]  # noqa: E731
+    q = cases.solved(rates, [1.0, 0.0], TIMES)[:, 0]
+    y = q + scale * (3 * q**2 - 2 * q**4) + NOISE * np.random.default_rng(2).normal(size=len(q))
+    more = (
+        '[parameters]\nk = { value = 1.0, sd = 0.1 }\n[[terms]]\neffect = "viscous_damping"\ntarget = "q"\nc = 0.01\n'
+    )
+    p = cases.problem(cases.simulation("p**2/2 + k*q**2/2", more=more), [cases.recorded(TIMES, y)], 0.05)
+    priors = replace(priors_without_effects(p), precision=np.full(p.size, 1e-2))
+    begin = np.zeros(p.size)
+    begin[[0, p.head]] = 1.0
+    fits = calibrate(Stepper(p), begin[None], [()], priors, [len(TIMES)])
+    assert fits.converged[0]
+    kinds = (weigh_white, weigh_coloured, weigh_positional)
+    return [weigh(p, fits, priors, [len(TIMES)])[0] for weigh in kinds]
+
+
+def test_a_bent_scale_is_seen_as_one():
+    """Of a sensor that is off by up to three times its noise, in a way that repeats with the decaying motion: tens of
+    nats above an error that only remembers itself, and that above white noise; the noise told is what it errs by."""
+    white, coloured, positional = evidences(0.03)
+    assert positional.kind == "positional"
+    assert positional.log_evidence > coloured.log_evidence + 10 > white.log_evidence + 20
+    assert NOISE < positional.noise[0] < 0.05
+    assert positional.inflation < white.inflation
+
+
+def test_white_noise_goes_with_nothing():
+    """No evidence is gained where the sensor is straight."""
+    white, _, positional = evidences(0.0)
+    assert positional.log_evidence < white.log_evidence + 1.0
+    assert positional.noise[0] == pytest.approx(NOISE, rel=0.1)
