@@ -51,7 +51,7 @@ class AbstractHamiltonian(eqx.Module):
         """dH/dq, minus the force of the Hamiltonian."""
         return jax.grad(self.energy, argnums=0)(q, p)
 
-    def vector_field(self, x: Float[Array, " two_d"]) -> Float[Array, " two_d"]:
+    def vector_field(self, x: Float[Array, "two_d ..."]) -> Float[Array, "two_d ..."]:
         """dx/dt at the phase point x."""
         q, p = split(x)
         return jnp.concatenate([self.velocity(q, p), -self.slope(q, p)])
