@@ -168,5 +168,6 @@ def every_at(
             lost = {"status": "crashed", "seconds": 0.0, "document": None, "forecast": None}
             found[case] = lost | {"told": outcome.failure, "files": marks[case]}
         went = time.monotonic() - begun
-        tell(f"diagnosed {k} of {len(missing)} ({case.name}: {found[case]['status']}), {went:.0f} s")
+        why = "" if outcome.failure is None else f": {outcome.failure}"
+        tell(f"diagnosed {k} of {len(missing)} ({case.name}: {found[case]['status']}{why}), {went:.0f} s")
     return [found[case] for case in cases]

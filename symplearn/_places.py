@@ -6,6 +6,7 @@ other case along than the one it was at, which Dask tries on other workers as of
 """
 
 import abc
+import pickle
 import re
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -78,12 +79,13 @@ class Cluster(AbstractPlace):
         if not found or int(found["port"]) > 65535:
             raise InputError(f"--scheduler: {shown(address)} is no address; give one as tcp://HOST:8786")
         try:
+            import cloudpickle
             import distributed
         except ImportError:
             raise InputError(
                 "--scheduler: Dask distributed is not installed here; `pip install 'symplearn[cluster]'` installs it"
             ) from None
-        self._dask, self._address, self._tell = distributed, address, tell
+        self._dask, self._address, self._tell, self._pickled = distributed, address, tell, cloudpickle.dumps
         try:
             self._client = distributed.Client(address, timeout=_PATIENCE, set_as_default=False)
         except (OSError, ValueError) as error:
@@ -101,7 +103,7 @@ class Cluster(AbstractPlace):
             while waiting or running:
                 # No more than are begun at once: what only waits at a worker would count as failed when that dies.
                 for number, case in [waiting.popleft() for _ in range(min(len(waiting), self._idle(len(running))))]:
-                    future = self._client.submit(work, *case, pure=False)
+                    future = self._client.submit(pickle.loads, self._pickled(_Sealed(work, case)), pure=False)
                     running[future.key] = number, future
                 for future in self._ended([future for _, future in running.values()]):
                     yield self._outcome(running.pop(future.key)[0], future)
@@ -133,6 +135,16 @@ class Cluster(AbstractPlace):
         error = future.exception()
         died = isinstance(error, self._dask.KilledWorker)
         return Outcome(number, failure="every worker that was at it died" if died else _in_words(error))
+
+
+class _Sealed(NamedTuple):
+    """Work on a case that is done where its pickle is opened: the scheduler, which has nothing of ours, opens none."""
+
+    work: Callable[..., Any]
+    case: tuple[Any, ...]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self.work, self.case
 
 
 def place(scheduler: str | None, tell: Callable[[str], None] = lambda line: None) -> AbstractPlace:

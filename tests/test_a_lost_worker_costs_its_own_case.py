@@ -1,6 +1,7 @@
 """Cases run here or on a Dask cluster: a worker that dies costs its own case a second try, and nothing else."""
 
 import contextlib
+import importlib
 import json
 import os
 import signal
@@ -70,14 +71,14 @@ def dask(log, *words, **environment):
 
 
 @contextlib.contextmanager
-def cluster(folder, workers):
+def cluster(folder, workers, **environment):
     """A scheduler that gives a case up at its second death, with so many worker processes: address and process."""
     words = ("--host", "localhost", "--port", "0", "--no-dashboard", "--scheduler-file", "scheduler.json")
     processes = [dask(folder / "scheduler", "scheduler", *words, DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="1")]
     try:
         address = until(lambda: address_in(folder / "scheduler.json"))
         words = (address, "--nthreads", "1", "--no-nanny", "--no-dashboard")
-        processes += [dask(folder / f"worker{k}", "worker", *words) for k in range(workers)]
+        processes += [dask(folder / f"worker{k}", "worker", *words, **environment) for k in range(workers)]
         with distributed.Client(address, set_as_default=False) as client:
             client.wait_for_workers(workers, timeout=60)
         yield address, processes[0]
@@ -148,6 +149,19 @@ def test_a_case_that_kills_every_worker_is_a_failure(tmp_path):
     assert found[0] == Outcome(0, failure="every worker that was at it died")
     assert found[1].failure.startswith("ZeroDivisionError: ")
     assert found[2:] == [Outcome(k, k) for k in range(2, 5)]
+
+
+def test_the_scheduler_needs_nothing_of_the_work(tmp_path, monkeypatch):
+    """A module that the workers have and the scheduler has not is enough; one that they lack is told by its name."""
+    for folder, name in (("theirs", "halving"), ("ours", "thirding")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / f"{name}.py").write_text("def work(number):\n    return number / 2\n")
+        monkeypatch.syspath_prepend(tmp_path / folder)
+    works = [importlib.import_module(name).work for name in ("halving", "thirding")]
+    with cluster(tmp_path, 1, PYTHONPATH=str(tmp_path / "theirs")) as (address, _), place(address) as workers:
+        (found,), (lost,) = (list(workers.outcomes(work, [(3,)])) for work in works)
+    assert found == Outcome(0, 1.5)
+    assert lost.failure == "ModuleNotFoundError: No module named 'thirding'"
 
 
 def test_a_scheduler_that_goes_away_is_told(tmp_path):
