@@ -81,7 +81,8 @@ def evidence(y, columns, widths):
 
 
 def any_strength(y, names):
-    """The same with each effect of any order of magnitude: from four standard errors to the largest, equally likely."""
+    """The same with each effect of any order of magnitude: from four standard errors to the largest, equally likely,
+    each density times the square of the strength."""
     columns = [column for name in names for column in COLUMNS[name]]
     own = np.repeat(np.arange(len(names)), [len(COLUMNS[name]) for name in names])
     covariance = evidence(y, columns, SCALE + 0 * own)[1] / SCALE**2
@@ -89,7 +90,11 @@ def any_strength(y, names):
     for k in range(len(names)):
         told = np.mean(np.maximum(1 / np.linalg.eigvalsh(covariance[np.ix_(own == k, own == k)]) - 1, 0))
         shares.append(np.geomspace(min(4 / np.sqrt(told), 1.0), 1.0, WIDTHS))
-    each = [evidence(y, columns, SCALE * np.array(c)[own])[0] for c in itertools.product(*shares)]
+    each = []
+    for widths in itertools.product(*shares):
+        value, covariance, z = evidence(y, columns, SCALE * np.array(widths)[own])
+        square = (z[3:] ** 2 + np.diag(covariance)) / (SCALE * np.array(widths)[own]) ** 2
+        each.append(value + sum(np.log(square[own == k].mean()) for k in range(len(names))))
     return logsumexp(each) - np.log(len(each))
 
 

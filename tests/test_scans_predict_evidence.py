@@ -101,7 +101,7 @@ def columns(times, effect, place):
 
 
 def least_squares(problem, further=None, recordings=(), scale=SCALE):
-    """Log evidence and precision of linear least squares with Gaussian priors; `further` are columns by recording."""
+    """Log evidence, precision and solution of linear least squares with Gaussian priors; `further` columns by run."""
     design, y, sd = [], [], [*X0_SD, *X0_SD, PULL_SD, *np.resize(scale, len(further[0]) if further else 0)]
     for r, run in enumerate(problem.rows):
         block = np.zeros((len(run.times), len(sd)))
@@ -116,11 +116,12 @@ def least_squares(problem, further=None, recordings=(), scale=SCALE):
     A, b = np.vstack([J, np.diag(1 / np.array(sd))]), np.concatenate([y, np.zeros(len(sd))])
     z, *_ = np.linalg.lstsq(A, b, rcond=None)
     determinant = np.linalg.slogdet(A.T @ A)[1]
-    return -0.5 * ((b - A @ z) ** 2).sum() - 0.5 * determinant - np.log(sd).sum(), A.T @ A
+    return -0.5 * ((b - A @ z) ** 2).sum() - 0.5 * determinant - np.log(sd).sum(), A.T @ A, z
 
 
 def refit_gain(problem, effect, place, recordings):
-    """With amplitudes of every order of magnitude, from four standard errors to the largest, equally likely."""
+    """With amplitudes of every order of magnitude, from four standard errors to the largest, equally likely, and of
+    each density the one times the square of the strength."""
     by_run = [columns(run.times, effect, place) for run in problem.rows]
     return mixture(problem, by_run, recordings, np.full(len(by_run[0]), SCALE))
 
@@ -130,7 +131,11 @@ def mixture(problem, by_run, recordings, largest):
     covariance = np.linalg.inv(least_squares(problem, by_run, recordings, largest)[1])[5:, 5:]
     told = (np.linalg.inv(covariance) - np.diag(largest**-2.0)) * np.outer(largest, largest)
     shares = np.geomspace(min(4 / np.sqrt(np.trace(told) / len(told)), 1.0), 1.0, WIDTHS)
-    each = [least_squares(problem, by_run, recordings, share * largest)[0] for share in shares]
+    each = []
+    for share in shares:
+        value, precision, z = least_squares(problem, by_run, recordings, share * largest)
+        square = (z[5:] ** 2 + np.diag(np.linalg.inv(precision))[5:]) / (share * largest) ** 2
+        each.append(value + np.log(square.mean()))
     return logsumexp(each) - np.log(len(each)) - least_squares(problem)[0]
 
 

@@ -23,18 +23,21 @@ def posterior(told, likelihood):
     [(0.01, 0.05, NONE), (0.1, 0.3, NONE), (1e-3, 0.004, 0.0), (0.1, -0.1, 0.0), (0.1, 0.1, -0.2)],
 )  # fmt: skip
 def test_one_amplitude_is_integrated_as_quadrature_does(sd, told, lowest):
-    """The gain of the mixture is the ratio of two integrals over the amplitude, each by SciPy's quadrature."""
+    """The gain of the mixture, each width with the amplitude's square, is the ratio of two integrals over the
+    amplitude, each by SciPy's quadrature."""
     widths = np.geomspace(4.0 * sd, 1.0, WIDTHS)
 
-    def evidence(width):
+    def evidence(width, squared):
         prior = stats.truncnorm(lowest / width, np.inf, scale=width)
+        square = (lambda a: a**2 / (prior.var() + prior.mean() ** 2)) if squared else (lambda a: 1.0)
         low, high = max(lowest, told - 12 * sd), max(told, lowest) + 12 * sd
-        value, _ = integrate.quad(lambda a: stats.norm.pdf(told, a, sd) * prior.pdf(a), low, high, epsabs=0, limit=300)
+        density = lambda a: stats.norm.pdf(told, a, sd) * prior.pdf(a) * square(a)  # noqa: E731
+        value, _ = integrate.quad(density, low, high, epsabs=0, limit=300)
         return value
 
     centre, spread = posterior(np.array([told]), np.array([[sd**2]]))
     gain = mixture_gain(centre, spread, np.zeros(1, int), np.array([lowest]))
-    expected = np.log(np.mean([evidence(w) for w in widths]) / evidence(1.0))
+    expected = np.log(np.mean([evidence(w, True) for w in widths]) / evidence(1.0, False))
     assert gain == pytest.approx(expected, abs=1e-7)  # quadrature's own 1.5e-8, relative, of either integral
 
 
@@ -55,28 +58,41 @@ def test_alone_an_effect_may_be_too_weak_to_be_seen():
         assert least < np.exp(gain) / nothing < most
 
 
-def test_two_effects_have_a_width_each():
-    """Of two correlated effects every pair of widths counts: densities of what is told, summed by SciPy."""
+@pytest.mark.parametrize(("correlated", "tolerance"), [(0.0, 1e-10), (6e-4, 0.2)])
+def test_two_effects_have_a_width_each(correlated, tolerance):
+    """Every pair of widths counts, with both squares: densities of what is told by SciPy, times the mean of both
+    squares under what is then known (Isserlis 1918). That of correlated effects is taken apart into two."""
     told = np.array([0.2, -0.03])
-    likelihood = np.array([[4e-3, 6e-4], [6e-4, 1e-3]])
+    likelihood = np.array([[4e-3, correlated], [correlated, 1e-3]])
     centre, spread = posterior(told, likelihood)
     shares = []
     for k in range(2):
         information = 1.0 / spread[k, k] - 1.0  # one entry, the other one left open
         shares.append(np.geomspace(4.0 / np.sqrt(information), 1.0, WIDTHS))
     density = lambda a, b: stats.multivariate_normal.pdf(told, cov=likelihood + np.diag([a**2, b**2]))  # noqa: E731
-    expected = np.log(np.mean([density(*pair) for pair in product(*shares)]) / density(1.0, 1.0))
+
+    def squares(a, b):
+        C = np.linalg.inv(np.linalg.inv(likelihood) + np.diag([a**-2, b**-2]))
+        m = C @ np.linalg.solve(likelihood, told)
+        both = (m[0] ** 2 + C[0, 0]) * (m[1] ** 2 + C[1, 1]) + 4 * m[0] * m[1] * C[0, 1] + 2 * C[0, 1] ** 2
+        return both / (a * b) ** 2
+
+    each = [density(*pair) * squares(*pair) for pair in product(*shares)]
     gain = mixture_gain(centre, spread, np.arange(2), np.full(2, NONE))
-    assert gain == pytest.approx(expected, abs=1e-10)  # round-off of inverses with condition numbers of some 100
+    # Round-off of inverses with condition numbers of some 100; a fifth of a nat changes no probability by much.
+    assert gain == pytest.approx(np.log(np.mean(each) / density(1.0, 1.0)), abs=tolerance)
 
 
 def test_the_two_parts_of_one_effect_share_a_width():
-    """A cosine and a sine are as wide as one another: one width for both in every term of the mean."""
+    """A cosine and a sine are as wide as one another: one width for both in every term of the mean, and the square is
+    of both together."""
     told, sd = np.array([0.1, 0.05]), 0.01
     centre, spread = posterior(told, sd**2 * np.eye(2))
     widths = np.geomspace(4.0 * sd, 1.0, WIDTHS)
     density = lambda w: stats.norm.pdf(told, scale=np.hypot(w, sd)).prod()  # noqa: E731
-    expected = np.log(np.mean([density(w) for w in widths]) / density(1.0))
+    known = lambda w: w**2 / (w**2 + sd**2)  # noqa: E731
+    square = lambda w: np.mean((known(w) * told) ** 2 + known(w) * sd**2) / w**2  # noqa: E731
+    expected = np.log(np.mean([density(w) * square(w) for w in widths]) / density(1.0))
     gain = mixture_gain(centre, spread, np.zeros(2, int), np.full(2, NONE))
     assert gain == pytest.approx(expected, abs=1e-10)  # round-off
 
@@ -99,15 +115,20 @@ def test_the_same_evidence_whatever_the_unit():
 
 
 def test_what_is_not_there_still_pays():
-    """An effect estimated at nothing is less likely than nothing, however small it may be."""
+    """An effect estimated at nothing is a fiftieth as likely as nothing, however small it may be; at two standard
+    deviations it is still the less likely one, at four it no longer is."""
     for sd in (1 / 30, 1 / 30_000):
-        assert evidence_beside_nothing(sd, 0.0) < -1.4
+        assert evidence_beside_nothing(sd, 0.0) < -3.9 and evidence_beside_nothing(sd, 2 * sd) < -1.0
+        assert evidence_beside_nothing(sd, 4 * sd) > 2.0
 
 
 def test_what_the_recording_cannot_show_gains_nothing():
-    """Where the estimate is nearly as wide as its prior there are no narrower priors to speak of."""
+    """Where the estimate is nearly as wide as its prior there are no narrower priors to speak of, and being near zero
+    counts against it."""
     centre, spread = posterior(np.array([0.3]), np.array([[0.5]]))
-    assert mixture_gain(centre, spread, np.zeros(1, int), np.full(1, NONE)) == 0.0
+    expected = np.log(centre[0] ** 2 + spread[0, 0])
+    gain = mixture_gain(centre, spread, np.zeros(1, int), np.full(1, NONE))
+    assert gain == pytest.approx(expected, abs=1e-10) and gain < 0
 
 
 @pytest.mark.parametrize("told", [(0.05, 0.09), (0.0, 0.1), (0.1, 0.02)], ids=["drives", "only damps", "turns far out"])
@@ -128,7 +149,8 @@ def test_a_self_excitation_turns_where_the_motion_is(told):
         return 4 * stats.norm.pdf(c, scale=scales[0]) * stats.norm.pdf(e, scale=scales[1])
 
     def turning(c, e):
-        strength = 2 * np.mean(stats.norm.pdf(c, scale=widths * scales[0]))
+        size = c / (widths * scales[0])
+        strength = 2 * np.mean(size**2 * stats.norm.pdf(c, scale=widths * scales[0]))
         a, motion = np.sqrt(c / e), np.sqrt(scales[0] / scales[1])
         return strength * stats.lognorm.pdf(a, np.log(2), scale=motion) * a / (2 * e)
 

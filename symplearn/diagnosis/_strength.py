@@ -6,7 +6,8 @@ whose widths are spread evenly in their logarithm. Fits are made under the wides
 
 One effect alone may be too weak for the recording to show: so much is left of its prior where nothing is seen, and the
 simulation as it is is as much less certain. Of several each is one that the recording can show; with a weaker one among
-them they are the smaller combination.
+them they are the smaller combination. So each Gaussian is multiplied there by the square of the strength, which leaves
+nothing at zero (the moment prior of Johnson and Rossell 2010): what is not needed counts far less than what is.
 """
 
 import itertools
@@ -83,7 +84,10 @@ def turning_gain(centre: np.ndarray, spread: np.ndarray, scales: np.ndarray, alo
     a = np.sqrt(c / e)
     # Density of e given c: that of ln a, by |d ln a / d e| = 1 / (2 e).
     turning = norm.logpdf(np.log(a), 0.5 * np.log(scales[0] / scales[1]), _TURNING) - np.log(2 * e)
-    strength = logsumexp(norm.logpdf(c[:, None], scale=size * scales[0]), axis=1) - np.log(len(size))
+    each = norm.logpdf(c[:, None], scale=size * scales[0])
+    if not alone:
+        each = each + 2 * np.log(c[:, None] / (size * scales[0]))
+    strength = logsumexp(each, axis=1) - np.log(len(size))
     wide = norm.logpdf(c, scale=scales[0]) + norm.logpdf(e, scale=scales[1]) + np.log(2.0)
     return float(logsumexp(mass + turning + strength - wide) - logsumexp(mass))
 
@@ -114,8 +118,9 @@ def mixture_gain(
     shares = [_shares(spread[np.ix_(own == k, own == k)], alone) for k in range(own[-1] + 1)]
     widths = np.array(list(itertools.product(*shares)))[:, own]
     widest = np.ones((1, len(own)))
-    weigh = lambda w: _log_weights(told, likelihood, w, lowest)  # noqa: E731
-    return float(logsumexp(weigh(widths)) - np.log(len(widths)) - weigh(widest)[0])
+    each, moments = _log_weights(told, likelihood, widths, lowest, own)
+    whole, _ = _log_weights(told, likelihood, widest, lowest, own)
+    return float(logsumexp(each + (0.0 if alone else moments)) - np.log(len(widths)) - whole[0])
 
 
 def _shares(spread: Float[np.ndarray, "b b"], alone: bool) -> np.ndarray:
@@ -136,8 +141,10 @@ def _widths(narrowest: float, alone: bool) -> np.ndarray:
     return np.geomspace(max(narrowest, 1e-12), 1.0, WIDTHS) if narrowest < 1.0 else np.ones(1)
 
 
-def _log_weights(told: np.ndarray, likelihood: np.ndarray, widths: np.ndarray, lowest: np.ndarray) -> np.ndarray:
-    """Log evidence of every choice of widths, up to one constant."""
+def _log_weights(
+    told: np.ndarray, likelihood: np.ndarray, widths: np.ndarray, lowest: np.ndarray, own: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Log evidence of every choice of widths, up to one constant, and what the squares of the strengths add to it."""
     prior = widths**2
     total = likelihood + prior[:, :, None] * np.eye(len(told))
     scale = np.sqrt(total[:, np.arange(len(told)), np.arange(len(told))])
@@ -147,9 +154,22 @@ def _log_weights(told: np.ndarray, likelihood: np.ndarray, widths: np.ndarray, l
     solved = inverse @ told
     out = -0.5 * solved @ told - 0.5 * np.linalg.slogdet(correlation)[1] - np.log(scale).sum(1)
     some = np.isfinite(lowest)
+    centre, covariance = prior * solved, prior[:, :, None] * (inverse @ likelihood)
     if some.any():
-        centre = (prior * solved)[:, some] - lowest[some]
-        covariance = prior[:, :, None] * (inverse @ likelihood)
-        out = out + orthants(centre, covariance[:, some][:, :, some])
-        out = out - orthants(np.broadcast_to(-lowest[some], centre.shape), prior[:, some, None] * np.eye(some.sum()))
-    return out
+        out = out + orthants(centre[:, some] - lowest[some], covariance[:, some][:, :, some])
+        out = out - orthants(
+            np.broadcast_to(-lowest[some], (len(out), some.sum())), prior[:, some, None] * np.eye(some.sum())
+        )
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    squares = _square(centre, variance, lowest) / _square(0.0 * centre, prior, lowest)
+    return out, sum(np.log(squares[:, own == k].mean(1)) for k in range(own[-1] + 1))
+
+
+def _square(centre: np.ndarray, variance: np.ndarray, lowest: np.ndarray) -> np.ndarray:
+    """Mean square of Gaussians that are cut off below a bound, each by itself."""
+    s = np.sqrt(np.maximum(variance, 1e-300))
+    below = np.maximum((lowest - centre) / s, -1e3)  # far below is no bound
+    edge = np.exp(norm.logpdf(below) - norm.logcdf(-below))
+    with np.errstate(invalid="ignore"):
+        cut = np.where(np.isfinite(lowest), s * (lowest + centre) * edge, 0.0)
+    return np.maximum(centre**2 + variance + cut, 1e-300)
