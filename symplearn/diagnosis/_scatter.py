@@ -81,14 +81,16 @@ def suspects(
         spread = 1.4826 * np.nanmedian(np.abs(joined - middle), axis=0)
         e = (joined - middle) / np.maximum(spread, 1e-300)
         far = np.abs(e) > _SUSPECT
-    far |= np.stack([_stand_apart(column) for column in e.T], axis=1)
+    for j, column in enumerate(e.T):
+        far[:, j] = _stand_apart(column, far[:, j])
     far &= far.mean(0) < _SHARE
     parts = np.split(far, np.cumsum([len(one) for one in errors])[:-1])
     clumps = [_clumped(part) for part in parts]
     # By chance, neighbours both lie off as often as the share squared; a motion that is missed goes on for a while.
-    expected = len(far) * far.mean(0) ** 2
-    chance = sum(clump.sum(0) for clump in clumps) <= 2 * (1 + expected + _CHANCE * np.sqrt(expected))
-    return [part & (chance | ~clump) for part, clump in zip(parts, clumps, strict=True)]
+    expected, pairs = len(far) * far.mean(0) ** 2, sum((part[1:] & part[:-1]).sum(0) for part in parts)
+    chance = pairs <= 1 + expected + _CHANCE * np.sqrt(expected)
+    some = chance | (sum(clump.sum(0) for clump in clumps) < far.sum(0) / 2)
+    return [part & some & (chance | ~clump) for part, clump in zip(parts, clumps, strict=True)]
 
 
 def _clumped(far: Bool[np.ndarray, "_ channel"]) -> Bool[np.ndarray, "_ channel"]:
@@ -99,19 +101,22 @@ def _clumped(far: Bool[np.ndarray, "_ channel"]) -> Bool[np.ndarray, "_ channel"
     return out
 
 
-def _stand_apart(e: Float[np.ndarray, " row"]) -> Bool[np.ndarray, " row"]:
-    """Errors of the wider of two scales, where two scales are much likelier than any noise of one."""
+def _stand_apart(e: Float[np.ndarray, " row"], far: Bool[np.ndarray, " row"]) -> Bool[np.ndarray, " row"]:
+    """Those that lie far off, and errors of the wider of two scales where these are much likelier than one; none where
+    so many are of the wider that it is the sensor's own way."""
     seen = np.isfinite(e)
-    x, out = e[seen], np.zeros(len(e), bool)
+    x, out = e[seen], far.copy()
     wide = np.abs(x) > _EDGE
     if not 0 < wide.mean() < _SHARE:
-        return out
+        return np.zeros_like(far)
     scales = Scales(float(wide.mean()), float(np.sqrt(np.mean(x[wide] ** 2))), float(np.sqrt(np.mean(x[~wide] ** 2))))
     for _ in range(_ROUNDS):
         scales = scales.refined(x, scales.belongs(x))
+    if scales.share > _SHARE:
+        return np.zeros_like(far)
     one = max(float(norm.logpdf(x, scale=np.sqrt(np.mean(x**2))).sum()), _student(x, True))
-    if scales.log_likelihood(x) > one + _APART and scales.share < _SHARE:
-        out[seen] = scales.belongs(x) > _CLEARLY
+    if scales.log_likelihood(x) > one + _APART:
+        out[seen] |= scales.belongs(x) > _CLEARLY
     return out
 
 
