@@ -22,12 +22,13 @@ from ._trajectory import LANES, Stepper
 from ._unnamed import Proposal
 from ._weigher import KEPT, Weigher
 
-# Combinations of one size are carried on to the next size while within this many nats of the best.
+# Combinations of one size are carried on to the next size while within this many nats of the best; where a missing
+# force leads by no more, what is left out is small.
 _REACH = 30.0
 # Combinations that are extended, most larger ones that are fitted, and what a larger one must gain to go on.
 _BASES, _PAIRS, _WORTH = 4, 32, 2.0
-# Nats by which a missing force may lead for effects to count as small, and how many of those are then fitted.
-_QUIET, _SMALL = 3.0, 24
+# How many effects are fitted where they are small.
+_SMALL = 24
 # Effects of the highest scores that may take another's part, beside all those without a place.
 _EXCHANGED = 24
 # Combinations that a missing force is tried beside.
@@ -278,7 +279,7 @@ class Search:
         begin with all rows from where its score puts it."""
         whites = [self.found.of(c, "white") for c in self.found.estimates if self._size(c) == size]
         top = max((e.log_evidence for e in whites if e is not None and e.converged), default=-np.inf)
-        return top > self.found.best(self.base) - (_QUIET if size == 0 else _REACH)
+        return top > self.found.best(self.base) - _REACH
 
     def _small_singles(self) -> list[Start]:
         """The effects of the highest scores, from where those put them."""
