@@ -25,11 +25,11 @@ def made(seed):
 def steppers():
     file = cases.simulation("p**2/2 + q**2/2", more=f"[recording.noise]\ny = {NOISE}")
     first = Stepper(cases.problem(file, [made(0)], 0.07))
-    return [first, *(first.on(cases.problem(file, [made(seed)], 0.07)) for seed in range(1, 6))]
+    return [first, *(first.on(cases.problem(file, [made(seed)], 0.07)) for seed in range(1, 3))]
 
 
 def test_a_stop_that_was_found_has_converged(steppers):
-    """In six recordings of one motion with different noise, from eight thresholds about the true one: the best fit
+    """In three recordings of one motion with different noise, from eight thresholds about the true one: the best fit
     follows the readings within their noise and counts as ended."""
     for stepper in steppers:
         p = stepper.problem
