@@ -340,8 +340,8 @@ class Search:
             regression = Regression(self.stepper, fits, self.rows, self.found.priors, some)
             known = self.found.estimates.__contains__
             starts = regression.subsets(size + len(self.base), known, _PAIRS // _BASES)
-            # From a trajectory that all rows are near to.
-            self.weigher.weigh(starts, whole=True)
+            if starts:  # from a trajectory that all rows are near to
+                self.weigher.weigh(starts, whole=True)
 
     def _gained(self, size: int) -> bool:
         """Whether the best of this size beats the best of smaller ones, so that a larger one may be worth it."""
