@@ -17,7 +17,7 @@ test: $(VENV)/project.stamp ## linter, formatter, types, and every test of secon
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
-	$(VENV)/bin/pytest -m "not slow" -n 2 --dist loadfile
+	$(VENV)/bin/pytest -m "not slow" -n 2 --dist loadfile --durations=30
 
 test-slow: $(VENV)/project.stamp ## the tests of minutes
 	$(VENV)/bin/pytest -m slow
