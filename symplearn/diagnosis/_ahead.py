@@ -36,6 +36,7 @@ def look_ahead(stepper: Stepper, found: Found, rows: Sequence[int]) -> None:
     found.ahead = _scores(stepper, found, [*near[: _MOST - len(bare)], *bare], rows)
 
 
+@np.errstate(all="ignore")  # a lane that diverged has no score
 def _scores(
     stepper: Stepper, found: Found, combinations: list[Combination], rows: Sequence[int]
 ) -> dict[Combination, Ahead]:
@@ -48,6 +49,8 @@ def _scores(
         total -= 0.5 * _READINGS * np.log(ahead).sum(1)
         holds &= (ahead < _HOLDS**2 * inside).all(1)
     total = np.where(np.isfinite(total), total, -np.inf)
+    if not np.isfinite(total.max()):
+        return {}
     return {c: Ahead(float(t - total.max()), bool(h)) for c, t, h in zip(combinations, total, holds, strict=True)}
 
 

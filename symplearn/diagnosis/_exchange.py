@@ -16,7 +16,7 @@ from .._effects import HIDDEN
 from ._calibrate import Fits, Priors, residuals, weights
 from ._problem import Combination, Problem
 from ._scan import layout, packed
-from ._score import Start, Unit
+from ._score import Start, Unit, inverse
 from ._strength import mixture_gain
 from ._trajectory import LANES, Stepper
 
@@ -77,10 +77,7 @@ class Regression:
         some, moved = np.concatenate([error[None], *columns]), others[free]
         cross, square = moved @ some.T, moved @ moved.T + np.diag(precision)
         cross[:, 0] += precision * off
-        scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
-        values, vectors = np.linalg.eigh(square / np.outer(scale, scale))
-        inverse = (vectors / np.maximum(values, _ROUND_OFF)) @ vectors.T / np.outer(scale, scale)
-        self.free, self.follow = free, inverse @ cross
+        self.free, self.follow = free, inverse(square) @ cross
         self.gram = some @ some.T - cross.T @ self.follow
         self.gram[0, 0] += float(precision @ off**2)
 
@@ -115,7 +112,7 @@ class Regression:
         a = np.concatenate([np.zeros(0, int), *(self.where[k] for k in chosen)])
         unit = self.width[a]
         square = self.gram[np.ix_(a, a)] * np.outer(unit, unit)
-        spread = np.linalg.inv(square + np.diag(1.0 + _ROUND_OFF * np.diag(square)))
+        spread = inverse(square + np.diag(1.0 + _ROUND_OFF * np.diag(square)))
         push = (self.error @ self.gram[:, a]) * unit
         sizes = spread @ push
         signed = np.isin(a, [self.where[k][0] for k in chosen if self._is_positive(k)])

@@ -48,6 +48,7 @@ class _Channel:
         return plain - (plain @ rest.T) @ np.linalg.solve(held, rest)
 
 
+@np.errstate(all="ignore")  # a lane that diverged is told by its evidence
 def weigh_positional(problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int]) -> list[Estimate]:
     """Estimates where each channel's error goes with what it reads, about the trajectory fit.
 

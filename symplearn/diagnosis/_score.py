@@ -83,17 +83,19 @@ def _remaining(
         place = np.concatenate([[0], 1 + problem.local(r)])
         gram[np.ix_(place, place)] += own[: len(place), : len(place)]
     vector = gram[0, 1:] - precision * (z - priors.mean_of(problem, combination))
-    inverse = _inverse(gram[1:, 1:][np.ix_(active, active)] + np.diag(precision[active]))
-    return Nuisance(active, inverse, vector[active])
+    found = inverse(gram[1:, 1:][np.ix_(active, active)] + np.diag(precision[active]))
+    return Nuisance(active, found, vector[active])
 
 
-def _inverse(matrix: np.ndarray) -> np.ndarray:
+def inverse(matrix: np.ndarray) -> np.ndarray:
     """The inverse; NaN where there is none. A direction that nothing holds keeps a wide, finite spread."""
-    if not np.isfinite(matrix).all():
-        return np.full_like(matrix, np.nan)
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    return (vectors / np.maximum(values, 1e-13)) @ vectors.T / np.outer(scale, scale)
+    with np.errstate(all="ignore"):  # a trajectory that ran away is told by NaN
+        scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        scaled = matrix / np.outer(scale, scale)
+        if not np.isfinite(scaled).all():
+            return np.full_like(matrix, np.nan)
+        values, vectors = np.linalg.eigh(scaled)
+        return (vectors / np.maximum(values, 1e-13)) @ vectors.T / np.outer(scale, scale)
 
 
 def score(
@@ -114,7 +116,7 @@ def score(
     after = others.inverse @ cross  # how the others follow a unit of each amplitude
     # What the others can take over wholly leaves a difference of round-off, not less than nothing.
     left = square - cross.T @ after + np.diag(scales**-2.0 + 1e-12 * np.diag(square))
-    spread = _inverse(left)
+    spread = inverse(left)
     push = vector - after.T @ others.vector
     amplitudes = spread @ push
     if not np.isfinite(amplitudes).all() or (one.effect.positive and amplitudes[0] < 0):
