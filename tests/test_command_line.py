@@ -131,6 +131,7 @@ def test_nothing_held_out_is_null(command, tmp_path):
     check_document(read(tmp_path / "out"), ["x_m"], ["p"], held_out=False)
 
 
+@pytest.mark.slow
 def test_effects_can_be_restricted(small, command, tmp_path):
     """--sensor-only and --dynamics-only keep every other effect out of findings and alternatives."""
     _, case, _ = small

@@ -124,7 +124,9 @@ def test_one_reading_is_a_recording():
     assert float(score) == pytest.approx(np.log(2 * np.pi) + np.log(4.0) + 5.0 / 8.0, rel=1e-12)
 
 
-@pytest.mark.parametrize("escapes", [False, True], ids=["sound", "failing"])
+@pytest.mark.parametrize(
+    "escapes", [pytest.param(False, marks=pytest.mark.slow, id="sound"), pytest.param(True, id="failing")]
+)
 def test_a_long_recording_in_stretches_is_the_same(monkeypatch, escapes):
     """Whether a gradient keeps the state at every reading or at every sqrt(n)-th one, value and slopes are the same."""
     random = np.random.default_rng(0)

@@ -47,6 +47,7 @@ def pendulum(gravity=8.5):
 PRIOR = Prior({"dynamics": Normal(9.0, 100.0), "measurement_noise": HalfNormal(1.0)})
 
 
+@pytest.mark.slow
 def test_the_truth_lies_in_the_interval_as_often_as_stated():
     """Over 20 recordings gravity and noise are within 2 sd of the truth about 95 times in a hundred."""
     inside = []

@@ -128,6 +128,7 @@ def test_the_score_is_the_textbook_kalman_filters():
     np.testing.assert_allclose(filtered.filtered_covariances[-1], P, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_objective_takes_it_as_an_option():
     """Several recordings under `vmap`, a flat prior on the first reading, and a list: all as sequentially."""
     ys = RANDOM.normal(size=(3, 9, 2))
