@@ -117,8 +117,9 @@ class Weigher:
         if cut < len(growing) and len(candidates) > KEPT:
             fits = grow(self.stepper, z, candidates, priors, growing[:cut], final=20, held=held)
             values = self._whites(fits, growing[cut - 1])
-            ranked = np.argsort(-np.where(np.isnan(values), -np.inf, values))
-            kept = [int(k) for k in ranked if held[k] or k in ranked[:KEPT]]
+            ranked = [int(k) for k in np.argsort(-np.where(np.isnan(values), -np.inf, values))]
+            # Beside the best some whose time may yet come.
+            kept = list(dict.fromkeys([*ranked[:KEPT], *[k for k in ranked if held[k]][:KEPT]]))
             z, candidates, held, growing = fits.z[kept], [candidates[k] for k in kept], held[kept], growing[cut:]
         elif len(growing) > 1 and len(candidates) > KEPT:
             # Who is far behind after most of the rows is not fitted to all of them, unless its time may yet come.
