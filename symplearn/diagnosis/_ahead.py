@@ -10,13 +10,15 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from .._effects import IMPULSE, REGIME
 from ._calibrate import calibrate, residuals, weights
 from ._found import Ahead, Found
 from ._problem import Combination
 from ._trajectory import LANES, Stepper
 
-# Nats by which a remainder stands above white noise, and by which an answer may lie behind the best to be looked at.
-_CLEAR, _REACH = 10.0, 100.0
+# Nats by which a remainder stands above white noise, by which an answer may lie behind the best to be looked at, and
+# which a score takes off at most: a fit to the first part may fail for reasons of its own.
+_CLEAR, _REACH, _WORST = 10.0, 100.0, 10.0
 _MOST = 2 * LANES
 # Shares of the rows that are fitted, steps of each fit, and what one channel's free run counts for.
 _ORIGINS, _STEPS, _READINGS = (0.4, 0.6, 0.8), 20, 2.0
@@ -28,8 +30,8 @@ def look_ahead(stepper: Stepper, found: Found, rows: Sequence[int]) -> None:
     """Keep what the likeliest combinations score, where the best leaves a clear remainder; else nothing."""
     ranked = sorted(found.estimates, key=found.best, reverse=True)
     top = found.best(ranked[0])
-    white = found.of(ranked[0], "white")
-    if not np.isfinite(top) or white is None or top < white.log_evidence + _CLEAR:
+    white = max(e.log_evidence for es in found.estimates.values() for e in es if e.kind == "white")
+    if not np.isfinite(top) or top < white + _CLEAR:
         return
     near = [c for c in ranked if found.best(c) > top - _REACH and found.of(c, "white")]
     bare = [c for c in found.estimates if c == () and c not in near[:_MOST]]
@@ -42,16 +44,19 @@ def _scores(
 ) -> dict[Combination, Ahead]:
     begin = np.stack([white.z for c in combinations if (white := found.of(c, "white"))])
     total, holds = np.zeros(len(begin)), np.ones(len(begin), bool)
+    # Of what happens at one time the first part may know nothing, so its values are those of the whole.
+    once = np.array([any(stepper.problem.candidate(m).effect in (IMPULSE, REGIME) for m in c) for c in combinations])
     for share in _ORIGINS:
         first = [max(1, round(n * share)) for n in rows]
-        fits = calibrate(stepper, begin, combinations, found.priors, first, _STEPS)
+        fits = calibrate(stepper, begin, combinations, found.priors, first, _STEPS, held=once)
         inside, ahead = _squares(stepper, fits.z, combinations, rows, first)
         total -= 0.5 * _READINGS * np.log(ahead).sum(1)
         holds &= (ahead < _HOLDS**2 * inside).all(1)
     total = np.where(np.isfinite(total), total, -np.inf)
     if not np.isfinite(total.max()):
         return {}
-    return {c: Ahead(float(t - total.max()), bool(h)) for c, t, h in zip(combinations, total, holds, strict=True)}
+    total = np.maximum(total - total.max(), -_WORST)
+    return {c: Ahead(float(t), bool(h)) for c, t, h in zip(combinations, total, holds, strict=True)}
 
 
 def _squares(

@@ -65,7 +65,7 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     top = max(e.log_evidence for es in found.estimates.values() for e in es)
     if not np.isfinite(top):
         return Posterior(0.0, 1.0, (), 0.0, _speaker(found.estimates[()]), {(): -np.inf}, factor)
-    unseen = min((one.score for one in found.ahead.values() if np.isfinite(one.score)), default=0.0)
+    unseen = min((one.score for one in found.ahead.values()), default=0.0)
     white, other, named = -np.inf, -np.inf, []
     evidences: dict[Combination, float] = {}
     for combination, estimates in found.estimates.items():
