@@ -100,6 +100,7 @@ def _entries(problem: Problem, combination: Combination, member: int) -> np.ndar
     return np.concatenate([np.arange(place.start, place.start + effect.amplitudes), *unseen]).astype(int)
 
 
+@np.errstate(all="ignore")  # a spread that round-off left without meaning gains nothing
 def mixture_gain(
     centre: Float[np.ndarray, " a"], spread: Float[np.ndarray, "a a"], own: np.ndarray, lowest: Float[np.ndarray, " a"],
     alone: bool = False,
@@ -120,7 +121,8 @@ def mixture_gain(
     widest = np.ones((1, len(own)))
     each, moments = _log_weights(told, likelihood, widths, lowest, own)
     whole, _ = _log_weights(told, likelihood, widest, lowest, own)
-    return float(logsumexp(each + (0.0 if alone else moments)) - np.log(len(widths)) - whole[0])
+    gain = float(logsumexp(each + (0.0 if alone else moments)) - np.log(len(widths)) - whole[0])
+    return gain if np.isfinite(gain) else 0.0
 
 
 def _shares(spread: Float[np.ndarray, "b b"], alone: bool) -> np.ndarray:
@@ -168,7 +170,7 @@ def _log_weights(
 def _square(centre: np.ndarray, variance: np.ndarray, lowest: np.ndarray) -> np.ndarray:
     """Mean square of Gaussians that are cut off below a bound, each by itself."""
     s = np.sqrt(np.maximum(variance, 1e-300))
-    below = np.maximum((lowest - centre) / s, -1e3)  # far below is no bound
+    below = np.clip((lowest - centre) / s, -1e3, 1e3)  # far below is no bound
     edge = np.exp(norm.logpdf(below) - norm.logcdf(-below))
     with np.errstate(invalid="ignore"):
         cut = np.where(np.isfinite(lowest), s * (lowest + centre) * edge, 0.0)
