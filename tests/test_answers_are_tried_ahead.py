@@ -62,6 +62,7 @@ def test_the_trajectory_that_holds_is_shown(clear):
     shown = found.shown(drag, coloured)
     place = found.problem.slots
     assert shown.kind == "white" and shown.covariance[place, place] >= white.covariance[place, place]
+    # Three standard errors, which chance passes once in 370; the recording and its noise are always the same.
     assert shown.z[place] == pytest.approx(0.02, abs=3 * np.sqrt(shown.covariance[place, place]))
 
 

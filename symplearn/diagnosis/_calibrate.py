@@ -148,8 +148,8 @@ def calibrate(
     """Levenberg-Marquardt over the first `rows` rows of every recording.
 
     A lane has converged when an undamped step promises less than `tolerance` of minus twice the log posterior; where
-    no step keeps what it promises, as about a threshold that passes a reading, less than `_SLIGHT`. The values of
-    effects do not move in lanes that are `held`.
+    the steps end before, as they do where none keeps what it promises, about a threshold that passes a reading, less
+    than `_SLIGHT`. The values of effects do not move in lanes that are `held`.
     """
     problem, lanes = stepper.problem, len(start)
     weight = weights(problem, rows)

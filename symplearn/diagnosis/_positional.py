@@ -7,6 +7,7 @@ proportion and are integrated out. A bias or a gain alone has a name of its own,
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -31,14 +32,19 @@ class _Channel:
     number: int  # readings
     log_weights: float
 
+    @cached_property
+    def gram(self) -> Float[np.ndarray, "column column"]:
+        """Of all columns."""
+        return self.columns @ self.columns.T
+
     def marginal(self, ratio: float) -> tuple[np.ndarray, float]:
         """Gram matrix of the plain columns with the polynomials integrated out, and the log determinant they leave."""
-        gram = self.columns @ self.columns.T
+        gram = self.gram
         first, rest = slice(None, self.plain), slice(self.plain, None)
         held = gram[rest, rest] + np.eye(len(gram) - self.plain) * (len(gram) - self.plain) / ratio
         taken = gram[first, rest] @ np.linalg.solve(held, gram[rest, first])
-        sign = np.linalg.slogdet(held * ratio / (len(gram) - self.plain))[1]
-        return gram[first, first] - taken, float(sign) - self.log_weights
+        determinant = np.linalg.slogdet(held * ratio / (len(gram) - self.plain))[1]
+        return gram[first, first] - taken, float(determinant) - self.log_weights
 
     def cleared(self, ratio: float) -> Float[np.ndarray, "column row"]:
         """The plain columns without what the polynomials take of them."""

@@ -238,12 +238,13 @@ class Search:
             white = self.found.of(c, "white")
             assert white is not None  # every combination is weighed under white noise first
             # Thinned frequencies miss an oscillation that stays in tune throughout, so the best one has more of them.
-            mine = self._scanned(c, white.z, _FEW if k else _MANY)
+            fits = self._fitted(c, white.z)
+            mine = self._scanned(fits, _FEW if k else _MANY)
             promised = [replace(start, gain=start.gain + white.log_evidence) for start in mine]
             # As many of each: what a score promises about a poor fit is too much.
             self._keep(promised, kept)
-            if not k:
-                self._weigh_exchanged(c, white.z, mine, size)
+            if not k and fits is not None:
+                self._weigh_exchanged(fits, mine, size)
         return sorted(kept.values(), key=lambda start: -start.gain)
 
     def _keep(self, listed: Sequence[Start], kept: dict[tuple[Combination, int], Start]) -> None:
@@ -263,7 +264,7 @@ class Search:
         starts = [Start(self._with(c), zero, 0.0) for c in plain if problem.candidate(c).effect is not OUTLIERS]
         white = self.found.of(self.base, "white")
         assert white is not None
-        found = self._scanned(self.base, white.z, _MANY)
+        found = self._scanned(self._fitted(self.base, white.z), _MANY)
         best = self._null
         if np.isfinite(best.log_evidence):
             found += scan(problem, on_path(self.stepper, best, self.rows), best.z, self.base, self.found.priors,
@@ -285,7 +286,8 @@ class Search:
         """The effects of the highest scores, from where those put them."""
         white = self.found.of(self.base, "white")
         assert white is not None
-        found = sorted(self._scanned(self.base, white.z, _MANY), key=lambda start: -start.gain)
+        scanned = self._scanned(self._fitted(self.base, white.z), _MANY)
+        found = sorted(scanned, key=lambda start: -start.gain)
         return found[:_SMALL]
 
     def _with(self, member: int) -> Combination:
@@ -307,11 +309,11 @@ class Search:
             out += units[:: max(1, -(-len(units) // most))]
         return out
 
-    def _scanned(self, combination: Combination, z: np.ndarray, most: int) -> list[Start]:
-        """Starts with one effect more than a fitted combination."""
-        fits = self._fitted(combination, z)
+    def _scanned(self, fits: Fits | None, most: int) -> list[Start]:
+        """Starts with one effect more than a fitted combination; none about one that ran away."""
         if fits is None:
             return []
+        (combination,), (z,) = fits.combinations, fits.z
         grams = on_trajectory(self.stepper, fits, 0, self.rows)
         wrong = noise_starts(self.problem, fits, self.rows)
         return wrong + scan(self.problem, grams, z, combination, self.found.priors, self._units(most))
@@ -324,10 +326,10 @@ class Search:
         fits = Fits([combination], z[None], noise, predictions, np.zeros(1), np.ones(1, bool))
         return fits if np.isfinite(noise).all() else None
 
-    def _weigh_exchanged(self, combination: Combination, z: np.ndarray, found: Sequence[Start], size: int) -> None:
+    def _weigh_exchanged(self, fits: Fits, found: Sequence[Start], size: int) -> None:
         """Combinations of one size that may do as well as the best of the size below, whose members they need not
         have: of all effects without a place, and of others where one more of them helps most."""
-        problem, fits = self.problem, self._fitted(combination, z)
+        problem, (combination,) = self.problem, fits.combinations
         units = {m: Unit(m, None) for m in problem.searched if not problem.candidate(m).effect.places}
         for start in sorted(found, key=lambda start: -start.gain)[:_EXCHANGED]:
             (member,) = set(start.combination) - set(combination)
@@ -336,7 +338,7 @@ class Search:
             units.setdefault(member, Unit(problem.whole(member), float(start.z[place]) if is_placed else None))
         some = {m: unit for m, unit in units.items() if problem.candidate(m).effect.amplitudes and m not in combination
                 and problem.candidate(m).effect is not HIDDEN}  # fmt: skip
-        if fits is not None and some:
+        if some:
             regression = Regression(self.stepper, fits, self.rows, self.found.priors, some)
             known = self.found.estimates.__contains__
             starts = regression.subsets(size + len(self.base), known, _PAIRS // _BASES)

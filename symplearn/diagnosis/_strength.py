@@ -172,6 +172,5 @@ def _square(centre: np.ndarray, variance: np.ndarray, lowest: np.ndarray) -> np.
     s = np.sqrt(np.maximum(variance, 1e-300))
     below = np.clip((lowest - centre) / s, -1e3, 1e3)  # far below is no bound
     edge = np.exp(norm.logpdf(below) - norm.logcdf(-below))
-    with np.errstate(invalid="ignore"):
-        cut = np.where(np.isfinite(lowest), s * (lowest + centre) * edge, 0.0)
+    cut = np.where(np.isfinite(lowest), s * (lowest + centre) * edge, 0.0)
     return np.maximum(centre**2 + variance + cut, 1e-300)
