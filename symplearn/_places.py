@@ -1,8 +1,8 @@
 """Where many independent cases are worked on: in this process, or by the workers of a Dask cluster.
 
 What a case gives is handed over as soon as it is done, so that whoever asked can keep it. A worker that dies takes no
-other case along than the one it was at, which Dask tries on other workers as often as its scheduler allows
-(`distributed.scheduler.allowed-failures`, 3 times).
+other case along than the one it was at, and what it gave in the moment before; Dask tries those on other workers as
+often as its scheduler allows (`distributed.scheduler.allowed-failures`, 3 times).
 """
 
 import abc

@@ -96,8 +96,11 @@ def address_in(file):
 
 
 def test_a_killed_worker_costs_its_own_case(tmp_path):
-    """Of two processes one is killed at its case: the other tries that again, and runs every other case once."""
-    log, held = tmp_path / "log", tmp_path / "held"
+    """Of two processes one is killed at its case: the other tries that again, and runs every other case once.
+
+    Killed once all others are handed over: what lay at the dead worker still would be worked out again.
+    """
+    log, held, found = tmp_path / "log", tmp_path / "held", []
 
     # Inside the test, so that the worker is sent the function itself and imports nothing of ours.
     def work(number, log=str(log), held=str(held)):
@@ -111,14 +114,16 @@ def test_a_killed_worker_costs_its_own_case(tmp_path):
         return number**2
 
     def kill():
-        os.kill(until(lambda: next((pid for number, pid in lines(log) if number == 2), None)), signal.SIGKILL)
+        until(lambda: True if len(found) == 7 else None)
+        os.kill(next(pid for number, pid in lines(log) if number == 2), signal.SIGKILL)
         held.unlink()
 
     held.touch()
     killer = threading.Thread(target=kill)
     killer.start()
     with cluster(tmp_path, 2) as (address, _), place(address) as workers:
-        found = list(workers.outcomes(work, [(k,) for k in range(8)]))
+        for outcome in workers.outcomes(work, [(k,) for k in range(8)]):
+            found.append(outcome)
     killer.join()
     assert sorted(found) == [Outcome(k, k**2) for k in range(8)]
     runs = lines(log)
