@@ -124,13 +124,14 @@ def grow(
 ) -> Fits:
     """Fit in one window after the other, each from the one before, the last to convergence.
 
-    In lanes that are `held` the values of the effects stay as they start until the last window: an early one may say
-    nothing of them.
+    In lanes that are `held` the values of the effects stay as they start until a window holds all rows: an earlier one
+    may say nothing of them.
     """
-    z = start
+    z, whole = start, [r.fitted for r in stepper.problem.rows]
     for number, rows in enumerate(windows):
         last = number == len(windows) - 1
-        fits = calibrate(stepper, z, combinations, priors, rows, final if last else 12, held=None if last else held)
+        free = None if list(rows) == whole else held
+        fits = calibrate(stepper, z, combinations, priors, rows, final if last else 12, held=free)
         z = fits.z
     return fits
 

@@ -5,7 +5,7 @@ unknowns follow (the score test of Rao 1948, nuisance projected out). A frequenc
 amplitude zero, so it is tried on a grid; the best places are where fits begin.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from itertools import zip_longest
 
 import numpy as np
@@ -22,7 +22,7 @@ from ._trajectory import DIRECTIONS, LANES, Stepper
 # Places tried for times and thresholds, and the most frequencies; frequencies this many times pi over the span apart.
 _TIMES, _THRESHOLDS, _FREQUENCIES, _SPACING = 60, 12, 160, 0.8
 # Starts kept for each effect and target, and for each choice of recordings.
-_BEST = 3
+BEST = 3
 
 
 def grid(problem: Problem, priors: Priors, candidate: int) -> list[Unit]:
@@ -156,9 +156,12 @@ def _unseen(problem: Problem) -> np.ndarray:
 
 def scan(
     problem: Problem, grams: Grams, z: Float[np.ndarray, " z"], combination: Combination, priors: Priors,
-    units: Sequence[Unit],
+    units: Sequence[Unit], chosen: Container[int] = (),
 ) -> list[Start]:  # fmt: skip
-    """Starts of `combination` with one further effect each, the best places of every effect and target."""
+    """Starts of `combination` with one further effect each, the best places of every effect and target.
+
+    Places of the candidates that are `chosen` are the best already, and no neighbours of each other.
+    """
     lanes = list(packed(problem, units))
     found: dict[int, list[tuple[float, Start]]] = {}
     nuisances: dict[int, Nuisance] = {}
@@ -171,7 +174,7 @@ def scan(
                     start = score(problem, by_recording, z, combination, priors, unit, member, others)
                     if start is not None:
                         found.setdefault(member, []).append((0.0 if unit.place is None else unit.place, start))
-    return [start for listed in found.values() for start in _peaks(listed)]
+    return [start for member, listed in found.items() for start in _peaks(listed, problem.whole(member) in chosen)]
 
 
 def noise_starts(problem: Problem, fits: Fits, rows: Sequence[int]) -> list[Start]:
@@ -201,11 +204,11 @@ def _members(problem: Problem, unit: Unit, combination: Combination) -> list[int
     return [m for m in members if problem.is_possible((*combination, m))]
 
 
-def _peaks(listed: list[tuple[float, Start]]) -> list[Start]:
-    """The best places that are no neighbours of a better one."""
+def _peaks(listed: list[tuple[float, Start]], apart: bool) -> list[Start]:
+    """The best places that are no neighbours of a better one; all places are `apart` where none is."""
     listed = sorted(listed, key=lambda pair: pair[0])
     gains = np.array([start.gain for _, start in listed])
     padded = np.concatenate([[-np.inf], gains, [-np.inf]])
-    peak = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
+    peak = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:]) | apart
     ranked = sorted(np.nonzero(peak)[0], key=lambda k: -gains[k])
-    return [listed[k][1] for k in ranked[:_BEST]]
+    return [listed[k][1] for k in ranked[:BEST]]

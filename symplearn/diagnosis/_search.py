@@ -1,7 +1,7 @@
 """The search: nothing left out, single effects, pairs, triples; each fitted, and weighed under every remainder."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from ._scan import grid, noise_starts, on_path, on_trajectory, scan, spacing
 from ._score import Start, Unit
 from ._start import priors_without_effects, with_states
 from ._stochastic import free_run
+from ._tangent import sharp_units
 from ._trajectory import LANES, Stepper
 from ._unnamed import Proposal
 from ._weigher import KEPT, Weigher
@@ -29,6 +30,8 @@ _REACH = 30.0
 _BASES, _PAIRS, _WORTH = 4, 32, 2.0
 # How many effects are fitted where they are small.
 _SMALL = 24
+# Share of a promise that may be wrong.
+_VAGUE = 0.3
 # Effects of the highest scores that may take another's part, beside all those without a place.
 _EXCHANGED = 24
 # Combinations that a missing force is tried beside.
@@ -264,16 +267,15 @@ class Search:
         starts = [Start(self._with(c), zero, 0.0) for c in plain if problem.candidate(c).effect is not OUTLIERS]
         white = self.found.of(self.base, "white")
         assert white is not None
-        found = self._scanned(self._fitted(self.base, white.z), _MANY)
+        found = _promising(self._scanned(self._fitted(self.base, white.z), _MANY))
         best = self._null
         if np.isfinite(best.log_evidence):
-            found += scan(problem, on_path(self.stepper, best, self.rows), best.z, self.base, self.found.priors,
-                          self._units(_FEW))  # fmt: skip
-        top = max((start.gain for start in found), default=0.0)
-        placed = [s for s in found if self._new(s).effect.places and s.gain > top - _REACH]
-        part = [s for s in found if not self._new(s).effect.places and s.gain > top - _REACH
+            grams = on_path(self.stepper, best, self.rows)
+            found += _promising(scan(problem, grams, best.z, self.base, self.found.priors, self._units(_FEW)))
+        placed = [s for s in found if self._new(s).effect.places]
+        part = [s for s in found if not self._new(s).effect.places
                 and not set(s.combination) <= {*problem.searched, *self.base}]  # fmt: skip
-        return starts + placed + sorted(part, key=lambda s: -s.gain)[:_PAIRS]
+        return starts + placed + part
 
     def _is_near(self, size: int) -> bool:
         """Whether the best of a size nearly follows the recording, so that one effect more is small, and a fit may
@@ -298,14 +300,14 @@ class Search:
         (member,) = set(start.combination) - set(self.base)
         return self.problem.candidate(member)
 
-    def _units(self, most: int) -> list[Unit]:
-        """What is tried: every effect and target at every place, evenly thinned to at most so many places."""
+    def _units(self, most: int, sharp: Mapping[int, list[Unit]] | None = None) -> list[Unit]:
+        """What is tried: every effect and target at its `sharp` places, or at all, evenly thinned to so many at most."""
         out: list[Unit] = []
         substeps = sum(self.rows) * int(self.problem.rows[0].spans.pieces[0])
         load = substeps * (1 if self.problem.equations.separable else _NONSEPARABLE) / _CHEAP
         most = max(_LEAST, int(most / max(1.0, load)))
         for c in self.problem.searched:
-            units = grid(self.problem, self.found.priors, c)
+            units = (sharp or {}).get(c) or grid(self.problem, self.found.priors, c)
             out += units[:: max(1, -(-len(units) // most))]
         return out
 
@@ -316,7 +318,8 @@ class Search:
         (combination,), (z,) = fits.combinations, fits.z
         grams = on_trajectory(self.stepper, fits, 0, self.rows)
         wrong = noise_starts(self.problem, fits, self.rows)
-        return wrong + scan(self.problem, grams, z, combination, self.found.priors, self._units(most))
+        sharp = sharp_units(self.stepper, fits, self.rows, self.found.priors)
+        return wrong + scan(self.problem, grams, z, combination, self.found.priors, self._units(most, sharp), sharp)
 
     def _fitted(self, combination: Combination, z: np.ndarray) -> Fits | None:
         """A combination as it was fitted; None where it ran away."""
@@ -389,3 +392,10 @@ class Search:
             starts += beside(self._null, self.problem, self.rows, self.typical, c, white.z, every)
         w = self.weigher
         w.add_paths(fit_paths(w.stepper, starts, self.found.priors, self.rows, w.path_steps))
+
+
+def _promising(scanned: Sequence[Start]) -> list[Start]:
+    """Of what was looked at about one motion, what promises nearly as much as the best; the farther off that motion
+    is, the less exact are promises."""
+    ranked = sorted(scanned, key=lambda start: -start.gain)[:_PAIRS]
+    return [s for s in ranked if s.gain > ranked[0].gain - max(_REACH, _VAGUE * ranked[0].gain)]

@@ -108,7 +108,10 @@ def switches_of(problem: Problem, recording: int, hots: Float[np.ndarray, "lane 
 
 @eqx.filter_jit
 def _sensitivities(equations, integrator, course, zs, onehots, directions, rows, switches):
-    """Readings (lane, time, channel) and their slopes (lane, direction, time, channel) over the first `rows` rows."""
+    """Readings (lane, time, channel) and their slopes (lane, direction, time, channel) over the first `rows` rows.
+
+    Along the last axis the phase points follow the readings, so that one program serves `carried` too.
+    """
     state, f = 2 * equations.width, course.to_parameters.shape[0]
 
     def readings(z, onehot):
@@ -117,10 +120,11 @@ def _sensitivities(equations, integrator, course, zs, onehots, directions, rows,
 
         def body(k, carry):
             x, out = carry
-            out = out.at[k].set(read(x, (course.times[k], course.inputs[k])))
+            seen = read(x, (course.times[k], course.inputs[k]))
+            out = out.at[k].set(jnp.concatenate([seen, x]))
             return flow(x, jax.tree.map(lambda leaf: leaf[k], course.spans)), out
 
-        empty = jnp.zeros((course.times.shape[0], len(equations.columns)))
+        empty = jnp.zeros((course.times.shape[0], len(equations.columns) + state))
         return jax.lax.fori_loop(0, rows, body, (z[:state], empty))[1]
 
     def lane(z, onehot, along):
@@ -175,11 +179,13 @@ class Stepper:
         out, along = self._run(r, zs[chunk][:, local], hots, free, rows)
         slopes = np.zeros((len(some), len(local), rows, p.channels))
         for lane, places in enumerate(free):
-            slopes[lane, places] = along[lane, : len(places), :rows]
-        return Predictions(out[:, :rows], slopes)
+            slopes[lane, places] = along[lane, : len(places), :rows, : p.channels]
+        return Predictions(out[:, :rows, : p.channels], slopes)
 
-    def _run(self, r: int, local_z: np.ndarray, hots: np.ndarray, along: Sequence[np.ndarray], rows: int):
-        """Readings of at most `LANES` lanes and their slopes along the entries that `along` names."""
+    def _run(
+        self, r: int, local_z: np.ndarray, hots: np.ndarray, along: Sequence[np.ndarray], rows: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Readings and phase points of at most `LANES` lanes and their slopes along the entries that `along` names."""
         number, p = len(local_z), self.problem
         lanes = np.arange(LANES) % number
         width = -(-max(1, *map(len, along)) // DIRECTIONS) * DIRECTIONS
@@ -206,25 +212,54 @@ class Stepper:
         `laid` are lanes of further effects as `_scan.layout` has them, at most `LANES`; `combination` moves at `z`.
         """
         p, local = self.problem, self.problem.local(r)
+        some, hots = self._beside(z, combination, laid, r)
+        along = []
+        for _, matrix, amplitudes in laid:
+            unseen = [p.equations.width - 1, 2 * p.equations.width - 1] if matrix[-1].any() else []
+            along.append(np.concatenate([unseen, self._further + np.concatenate(amplitudes)]).astype(int))
+        _, slopes = self._run(r, some, hots, along, rows)
+        out = []
+        for lane, places in enumerate(along):
+            full = np.zeros((len(local), rows, p.channels))
+            full[places] = slopes[lane, : len(places), :rows, : p.channels]
+            out.append(full)
+        return out
+
+    def carried(
+        self, z: Float[np.ndarray, " z"], combination: Combination, laid: Sequence[Any], rows: int, r: int
+    ) -> list[Float[np.ndarray, "direction time _"]]:
+        """Slopes of one recording's readings and phase points: along its start, and along the amplitudes of each of
+        `laid`, as in `responses`."""
+        p = self.problem
+        nothing = np.zeros_like(laid[0][0]), np.zeros_like(laid[0][1]), []
+        along = [np.arange(p.state), *(self._further + np.concatenate(amplitudes) for _, _, amplitudes in laid)]
+        some, hots = self._beside(z, combination, [nothing, *laid], r)
+        found = []
+        for a in range(0, len(along), LANES):
+            _, slopes = self._run(r, some[a : a + LANES], hots[a : a + LANES], along[a : a + LANES], rows)
+            found += [own[: len(places), :rows] for own, places in zip(slopes, along[a : a + LANES], strict=True)]
+        return found
+
+    @property
+    def _further(self) -> int:
+        """Where the values of further effects stand in what one recording depends on."""
+        return self.problem.state + self.problem.calibrated.size
+
+    def _beside(
+        self, z: np.ndarray, combination: Combination, laid: Sequence[Any], r: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Unknowns and coefficients of lanes that move as a combination does and have further effects."""
+        p = self.problem
         fixed = p.coefficients(r, z, combination) - p.coefficients(r, z, ())
-        nuisance = p.state + p.calibrated.size
-        some, hots, along = [], [], []
-        for values, matrix, amplitudes in laid:
-            own = z[local].copy()
-            own[nuisance:] = values
+        some, hots = [], []
+        for values, matrix, _ in laid:
+            own = z[p.local(r)].copy()
+            own[self._further :] = values
             hot = matrix.copy()
             hot[-1] += fixed
             some.append(own)
             hots.append(hot)
-            unseen = [p.equations.width - 1, 2 * p.equations.width - 1] if matrix[-1].any() else []
-            along.append(np.concatenate([unseen, nuisance + np.concatenate(amplitudes)]).astype(int))
-        _, slopes = self._run(r, np.stack(some), np.stack(hots), along, rows)
-        out = []
-        for lane, places in enumerate(along):
-            full = np.zeros((len(local), rows, p.channels))
-            full[places] = slopes[lane, : len(places), :rows]
-            out.append(full)
-        return out
+        return np.stack(some), np.stack(hots)
 
 
 def _joined(parts: list[Predictions], order: np.ndarray) -> Predictions:
