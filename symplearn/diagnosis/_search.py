@@ -1,24 +1,23 @@
 """The search: nothing left out, single effects, pairs, triples; each fitted, and weighed under every remainder."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from .._effects import HIDDEN, OUTLIERS, Candidate
-from ._calibrate import Fits, Priors, estimate_noise, residuals, weights
+from .._effects import NOISE, OUTLIERS, Candidate
+from ._calibrate import Priors
 from ._effect_priors import motion_along, with_effects, with_unnamed
-from ._exchange import Regression
 from ._found import Found
 from ._noisy import PathFit, fit_paths
 from ._null_paths import beside, null_paths
 from ._problem import MOST, Combination, Problem
-from ._scan import grid, noise_starts, on_path, on_trajectory, scan, spacing
-from ._score import Start, Unit
+from ._prospects import Prospects, promising
+from ._scan import spacing
+from ._score import Start
 from ._start import priors_without_effects, with_states
 from ._stochastic import free_run
-from ._tangent import sharp_units
 from ._trajectory import LANES, Stepper
 from ._unnamed import Proposal
 from ._weigher import KEPT, Weigher
@@ -32,18 +31,16 @@ _BASES, _PAIRS, _WORTH = 4, 32, 2.0
 _SMALL = 24
 # Share of a promise that may be wrong.
 _VAGUE = 0.3
-# Effects of the highest scores that may take another's part, beside all those without a place.
-_EXCHANGED = 24
+# Effects that are fitted first, of the highest scores.
+_FIRST = 16
 # Combinations that a missing force is tried beside.
 _FORCED = 6
 # Combinations that are fitted between two looks at the clock.
 _BATCH = 24
 # Combinations whose places are moved, how near they are to the best; and those that are weighed again in finer steps.
 _MOVED, _NEAR, _AGAIN = 3, 8.0, 24
-# Places at which an effect is tried beside the best of the size below, and beside others; fewer where a trajectory
-# costs more than one of so many leapfrog substeps; how much more a substep of a nonseparable system costs.
-_MANY, _FEW, _LEAST = 160, 60, 10
-_CHEAP, _NONSEPARABLE = 600, 5
+# Places at which an effect is tried beside the best of the size below, and beside others.
+_MANY, _FEW = 160, 60
 _ONE_MORE = {1: "one effect", 2: "a second effect", 3: "a third effect"}
 
 
@@ -54,6 +51,7 @@ class Search:
         self.weigher = Weigher(stepper, Found(stepper.problem, priors_without_effects(stepper.problem)))
         self.seeds, self.seed, self.rows = seeds, seeds[0], self.weigher.rows
         self.deadline, self.progress = deadline, progress
+        self.prospects = Prospects(self.weigher)
 
     @property
     def found(self) -> Found:
@@ -78,16 +76,12 @@ class Search:
             if size > 1 and not self._in_time():
                 break
             self.progress(f"looking where {_ONE_MORE[size]} would help")
-            starts = self._proposals(size)
-            if not starts:
+            if size == 1:
+                self._weigh_singles()
+            elif starts := self._proposals(size):
+                self._weigh_in_batches(starts, self._is_near(size - 1))
+            else:
                 break
-            number = len({start.combination for start in starts})
-            self.progress(f"weighing {number} {'single effects' if size == 1 else f'combinations of {size} effects'}")
-            near = self._is_near(size - 1)
-            # The first single effects are weighed however little time is given.
-            for a in range(0, len(starts), _BATCH):
-                if (size == 1 and a == 0) or self._in_time():
-                    self.weigher.weigh(starts[a : a + _BATCH], whole=near)
             if size > 1 and not self._gained(size):
                 break
         self._move_places()
@@ -154,7 +148,8 @@ class Search:
     def again(self, stepper: Stepper) -> Found:
         """Fit and weigh the best combinations anew with another stepper of the same recordings."""
         w, before = self.weigher, self.found
-        kept = sorted(before.estimates, key=before.best, reverse=True)[:_AGAIN]
+        ranked = sorted(before.estimates, key=before.best, reverse=True)[:_AGAIN]
+        kept = [c for c in ranked if before.best(c) > before.best(ranked[0]) - _REACH]
         w.moved_to(stepper, Found(stepper.problem, before.priors, complete=before.complete))
         mine = [c for c in dict.fromkeys([self.base, *kept]) if set(self.base) <= set(c)]
         w.weigh([Start(c, white.z, 0.0) for c in mine if (white := before.of(c, "white"))], whole=True)
@@ -231,8 +226,6 @@ class Search:
 
     def _proposals(self, size: int) -> list[Start]:
         """Where fits of combinations of one size begin: each of the best of the size below with one effect more."""
-        if size == 1:
-            return self._singles()
         best = [c for c in self.found.estimates if self._size(c) == size - 1]
         best = sorted(best, key=self.found.best, reverse=True)
         top = self.found.best(best[0]) if best else -np.inf
@@ -241,14 +234,19 @@ class Search:
             white = self.found.of(c, "white")
             assert white is not None  # every combination is weighed under white noise first
             # Thinned frequencies miss an oscillation that stays in tune throughout, so the best one has more of them.
-            fits = self._fitted(c, white.z)
-            mine = self._scanned(fits, _FEW if k else _MANY)
+            mine = self.prospects.about(c, _FEW if k else _MANY)
             promised = [replace(start, gain=start.gain + white.log_evidence) for start in mine]
             # As many of each: what a score promises about a poor fit is too much.
             self._keep(promised, kept)
-            if not k and fits is not None:
-                self._weigh_exchanged(fits, mine, size)
+            if not k:
+                self._weigh_exchanged(c, size, _PAIRS // _BASES)
         return sorted(kept.values(), key=lambda start: -start.gain)
+
+    def _weigh_exchanged(self, combination: Combination, size: int, number: int) -> None:
+        """Combinations of a size that may do as well as the best one, from where a regression about it puts them."""
+        starts = [s for s in self.prospects.exchanged(combination, _MANY, size, number) if s.gain > -_REACH]
+        if starts:  # from a trajectory that all rows are near to
+            self.weigher.weigh(starts, whole=True)
 
     def _keep(self, listed: Sequence[Start], kept: dict[tuple[Combination, int], Start]) -> None:
         """Add the best of some starts, each combination from two places at most."""
@@ -258,24 +256,47 @@ class Search:
             if tried < 2 and len(kept) < most and start.combination not in self.found.estimates:
                 kept[start.combination, tried] = start
 
-    def _singles(self) -> list[Start]:
-        """Every effect that has no place from zero, in a growing window; the others from where they promise most."""
+    def _weigh_singles(self) -> None:
+        """Every effect alone, however little time there is for those of the highest scores.
+
+        From where the scores put them if the simulation nearly follows the recording; else from nothing, in a growing
+        window. Once one is found that follows it, the others begin where a regression about that one puts them.
+        """
+        scanned = self.prospects.about(self.base, _MANY)
         if self._is_near(0):
-            return self._small_singles()
-        problem, zero = self.problem, self._from_seed()
-        plain = [c for c in problem.searched if not problem.candidate(c).effect.places]
-        starts = [Start(self._with(c), zero, 0.0) for c in plain if problem.candidate(c).effect is not OUTLIERS]
-        white = self.found.of(self.base, "white")
-        assert white is not None
-        found = _promising(self._scanned(self._fitted(self.base, white.z), _MANY))
-        best = self._null
-        if np.isfinite(best.log_evidence):
-            grams = on_path(self.stepper, best, self.rows)
-            found += _promising(scan(problem, grams, best.z, self.base, self.found.priors, self._units(_FEW)))
-        placed = [s for s in found if self._new(s).effect.places]
-        part = [s for s in found if not self._new(s).effect.places
-                and not set(s.combination) <= {*problem.searched, *self.base}]  # fmt: skip
-        return starts + placed + part
+            self.weigher.weigh(promising(scanned, np.inf, 0.0, _SMALL), whole=True)
+            return
+        along = promising(self.prospects.along(self._null, _FEW), _REACH, _VAGUE, _FIRST)
+        first = promising(scanned, _REACH, _VAGUE, _FIRST) + [s for s in along if self._new(s).effect.places]
+        self.progress(f"weighing {len({s.combination for s in first})} likely effects")
+        self.weigher.weigh([s if self._new(s).effect.places else self._from_nothing(s.combination) for s in first])
+        if (best := self._adequate()) is not None:
+            self._weigh_exchanged(best, 1, _SMALL)
+            return
+        plain = [self._with(c) for c in self.problem.searched if not self.problem.candidate(c).effect.places
+                 and self.problem.candidate(c).effect is not OUTLIERS]  # fmt: skip
+        self._weigh_in_batches([self._from_nothing(c) for c in plain if c not in self.found.estimates])
+
+    def _from_nothing(self, combination: Combination) -> Start:
+        return Start(combination, self._from_seed(), 0.0)
+
+    def _weigh_in_batches(self, starts: Sequence[Start], whole: bool = False) -> None:
+        """As many as there is time for."""
+        self.progress(f"weighing {len({s.combination for s in starts})} combinations")
+        for a in range(0, len(starts), _BATCH):
+            if self._in_time():
+                self.weigher.weigh(starts[a : a + _BATCH], whole=whole)
+
+    def _adequate(self) -> Combination | None:
+        """A single effect that follows the recording as no remainder does beside it or instead of it."""
+        alone = [c for c in self.found.estimates if self._size(c) == 1]
+        best = max(alone, key=self.found.best)
+        white = self.found.of(best, "white")
+        rest = max(self.found.best(self.base), self._null.log_evidence)
+        if white is None or not white.converged or any(self.problem.candidate(m).effect is NOISE for m in best):
+            return None
+        is_white = white.log_evidence > self.found.best(best) - _WORTH
+        return best if is_white and white.log_evidence > rest + _REACH else None
 
     def _is_near(self, size: int) -> bool:
         """Whether the best of a size nearly follows the recording, so that one effect more is small, and a fit may
@@ -284,14 +305,6 @@ class Search:
         top = max((e.log_evidence for e in whites if e is not None and e.converged), default=-np.inf)
         return top > self.found.best(self.base) - _REACH
 
-    def _small_singles(self) -> list[Start]:
-        """The effects of the highest scores, from where those put them."""
-        white = self.found.of(self.base, "white")
-        assert white is not None
-        scanned = self._scanned(self._fitted(self.base, white.z), _MANY)
-        found = sorted(scanned, key=lambda start: -start.gain)
-        return found[:_SMALL]
-
     def _with(self, member: int) -> Combination:
         return tuple(sorted((*self.base, member)))
 
@@ -299,54 +312,6 @@ class Search:
         """The effect of a single one's start."""
         (member,) = set(start.combination) - set(self.base)
         return self.problem.candidate(member)
-
-    def _units(self, most: int, sharp: Mapping[int, list[Unit]] | None = None) -> list[Unit]:
-        """What is tried: every effect and target at its `sharp` places, or at all, evenly thinned to so many at most."""
-        out: list[Unit] = []
-        substeps = sum(self.rows) * int(self.problem.rows[0].spans.pieces[0])
-        load = substeps * (1 if self.problem.equations.separable else _NONSEPARABLE) / _CHEAP
-        most = max(_LEAST, int(most / max(1.0, load)))
-        for c in self.problem.searched:
-            units = (sharp or {}).get(c) or grid(self.problem, self.found.priors, c)
-            out += units[:: max(1, -(-len(units) // most))]
-        return out
-
-    def _scanned(self, fits: Fits | None, most: int) -> list[Start]:
-        """Starts with one effect more than a fitted combination; none about one that ran away."""
-        if fits is None:
-            return []
-        (combination,), (z,) = fits.combinations, fits.z
-        grams = on_trajectory(self.stepper, fits, 0, self.rows)
-        wrong = noise_starts(self.problem, fits, self.rows)
-        sharp = sharp_units(self.stepper, fits, self.rows, self.found.priors)
-        return wrong + scan(self.problem, grams, z, combination, self.found.priors, self._units(most, sharp), sharp)
-
-    def _fitted(self, combination: Combination, z: np.ndarray) -> Fits | None:
-        """A combination as it was fitted; None where it ran away."""
-        problem, weight = self.problem, weights(self.problem, self.rows)
-        predictions = self.stepper.predict(z[None], [combination], self.rows)
-        noise = estimate_noise(problem, [combination], residuals(problem, predictions, weight), weight)
-        fits = Fits([combination], z[None], noise, predictions, np.zeros(1), np.ones(1, bool))
-        return fits if np.isfinite(noise).all() else None
-
-    def _weigh_exchanged(self, fits: Fits, found: Sequence[Start], size: int) -> None:
-        """Combinations of one size that may do as well as the best of the size below, whose members they need not
-        have: of all effects without a place, and of others where one more of them helps most."""
-        problem, (combination,) = self.problem, fits.combinations
-        units = {m: Unit(m, None) for m in problem.searched if not problem.candidate(m).effect.places}
-        for start in sorted(found, key=lambda start: -start.gain)[:_EXCHANGED]:
-            (member,) = set(start.combination) - set(combination)
-            place = dict(problem.placed(start.combination))[member].stop - 1
-            is_placed = bool(problem.candidate(member).effect.places)
-            units.setdefault(member, Unit(problem.whole(member), float(start.z[place]) if is_placed else None))
-        some = {m: unit for m, unit in units.items() if problem.candidate(m).effect.amplitudes and m not in combination
-                and problem.candidate(m).effect is not HIDDEN}  # fmt: skip
-        if some:
-            regression = Regression(self.stepper, fits, self.rows, self.found.priors, some)
-            known = self.found.estimates.__contains__
-            starts = regression.subsets(size + len(self.base), known, _PAIRS // _BASES)
-            if starts:  # from a trajectory that all rows are near to
-                self.weigher.weigh(starts, whole=True)
 
     def _gained(self, size: int) -> bool:
         """Whether the best of this size beats the best of smaller ones, so that a larger one may be worth it."""
@@ -357,11 +322,16 @@ class Search:
     def _weigh_subsets(self) -> None:
         """What the best combinations become without each of their members, from where they are: what was weighed
         already may have been caught in a poorer optimum, which would make the member look needed."""
-        ranked = sorted((c for c in self.found.estimates if c), key=self.found.best, reverse=True)[:KEPT]
+        ranked = sorted(filter(self._is_worth_it, self.found.estimates), key=self.found.best, reverse=True)[:KEPT]
         less = dict.fromkeys(c[:k] + c[k + 1 :] for c in ranked for k in range(len(c)) if c[k] not in self.base)
         some = [c for c in less if c and (c not in self.found.estimates or self._is_behind(c, ranked))]
         if some:
             self.weigher.weigh([Start(c, self._shrunk(c, ranked), 0.0) for c in some[: 2 * KEPT]], whole=True)
+
+    def _is_worth_it(self, combination: Combination) -> bool:
+        """Whether no part of a combination does better without the rest."""
+        less = [c for c in self.found.estimates if set(c) < set(combination)]
+        return bool(combination) and self.found.best(combination) > max(map(self.found.best, less), default=-np.inf)
 
     def _is_behind(self, combination: Combination, ranked: Sequence[Combination]) -> bool:
         """Whether one member more is worth something."""
@@ -380,9 +350,12 @@ class Search:
         return z
 
     def _weigh_forces(self) -> None:
-        """Best combinations again, each with a missing force beside it."""
+        """Best combinations again, each with a missing force beside it; only the very best where that needs none."""
         named = sorted((c for c in self.found.estimates if self._size(c)), key=self.found.best, reverse=True)
-        self._add_forces(named[: KEPT // 2 if self.weigher.is_long else _FORCED], 2)
+        self._add_forces(named[:1], 2)
+        kinds = {e.kind: e.log_evidence for c in named[:1] for e in self.found.estimates[c]}
+        if kinds.pop("force", -np.inf) > max(kinds.values(), default=np.inf):
+            self._add_forces(named[1 : KEPT // 2 if self.weigher.is_long else _FORCED], 2)
 
     def _add_forces(self, combinations: Sequence[Combination], every: int) -> None:
         starts = []
@@ -392,10 +365,3 @@ class Search:
             starts += beside(self._null, self.problem, self.rows, self.typical, c, white.z, every)
         w = self.weigher
         w.add_paths(fit_paths(w.stepper, starts, self.found.priors, self.rows, w.path_steps))
-
-
-def _promising(scanned: Sequence[Start]) -> list[Start]:
-    """Of what was looked at about one motion, what promises nearly as much as the best; the farther off that motion
-    is, the less exact are promises."""
-    ranked = sorted(scanned, key=lambda start: -start.gain)[:_PAIRS]
-    return [s for s in ranked if s.gain > ranked[0].gain - max(_REACH, _VAGUE * ranked[0].gain)]

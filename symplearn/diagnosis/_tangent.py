@@ -181,8 +181,8 @@ def _recordings(stepper: Stepper, fits: Fits, rows: Sequence[int], priors: Prior
         back = np.linalg.pinv(phi)
         if not np.abs(phi @ back - np.eye(problem.state)).max() < _EXACT:
             return None
-        done = {unit.candidate: np.einsum("tds,ts->td", back, slopes[:, problem.channels :])
-                for units, lane in zip(lanes, further, strict=True) for unit, slopes in zip(units, lane, strict=True)}  # fmt: skip
+        pairs = [pair for units, lane in zip(lanes, further, strict=True) for pair in zip(units, lane, strict=True)]
+        done = {unit.candidate: np.einsum("tds,ts->td", back, x[:, problem.channels :]) for unit, x in pairs}
         slopes = start[:, :, : problem.channels].transpose(1, 2, 0) * roots[r][..., None]
         out.append(_Recording(problem.rows[r].times[: rows[r]], slopes, back, done, own, others))
     return out

@@ -231,7 +231,7 @@ class Stepper:
         """Slopes of one recording's readings and phase points: along its start, and along the amplitudes of each of
         `laid`, as in `responses`."""
         p = self.problem
-        nothing = np.zeros_like(laid[0][0]), np.zeros_like(laid[0][1]), []
+        nothing: Any = np.zeros_like(laid[0][0]), np.zeros_like(laid[0][1]), []
         along = [np.arange(p.state), *(self._further + np.concatenate(amplitudes) for _, _, amplitudes in laid)]
         some, hots = self._beside(z, combination, [nothing, *laid], r)
         found = []

@@ -1,0 +1,106 @@
+"""Where fits with one effect more begin: what promises most about a fit that was made."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from .._effects import HIDDEN
+from ._calibrate import Fits, estimate_noise, residuals, weights
+from ._exchange import Regression
+from ._noisy import PathFit
+from ._problem import Combination
+from ._scan import grid, noise_starts, on_path, on_trajectory, scan
+from ._score import Start, Unit
+from ._tangent import sharp_units
+from ._weigher import Weigher
+
+# Effects of the highest scores that may take another's part, beside all those without a place.
+_EXCHANGED = 24
+# Places at which an effect is tried at most; fewer where a trajectory costs more than one of so many leapfrog
+# substeps; how much more a substep of a nonseparable system costs.
+_LEAST = 10
+_CHEAP, _NONSEPARABLE = 600, 5
+
+
+class Prospects:
+    """What promises to help beside what a weigher has weighed."""
+
+    def __init__(self, weigher: Weigher):
+        self.weigher = weigher
+        self._known: dict[tuple[Combination, float, int], list[Start]] = {}
+
+    def about(self, combination: Combination, most: int) -> list[Start]:
+        """Starts with one effect more than a fitted combination, each of at most so many places; none about one that
+        ran away."""
+        white = self.weigher.found.of(combination, "white")
+        assert white is not None  # every combination is weighed under white noise first
+        key = combination, white.log_evidence, most
+        if key not in self._known:
+            fits = self._fitted(combination)
+            self._known[key] = [] if fits is None else self._scanned(fits, most)
+        return self._known[key]
+
+    def along(self, path: PathFit, most: int) -> list[Start]:
+        """Starts of single effects about a path that a missing force bends."""
+        w = self.weigher
+        if not np.isfinite(path.log_evidence):
+            return []
+        grams = on_path(w.stepper, path, w.rows)
+        return scan(w.problem, grams, path.z, w.base, w.found.priors, self._units(most))
+
+    def exchanged(self, combination: Combination, most: int, size: int, number: int) -> list[Start]:
+        """Combinations of a size, at most so many, that may do as well as a fitted one, whose members they need not
+        have: of all effects without a place, and of others where one more of them helps most."""
+        w, fits = self.weigher, self._fitted(combination)
+        if fits is None:
+            return []
+        problem = w.problem
+        units = {m: Unit(m, None) for m in problem.searched if not problem.candidate(m).effect.places}
+        for start in sorted(self.about(combination, most), key=lambda start: -start.gain)[:_EXCHANGED]:
+            (member,) = set(start.combination) - set(combination)
+            place = dict(problem.placed(start.combination))[member].stop - 1
+            is_placed = bool(problem.candidate(member).effect.places)
+            units.setdefault(member, Unit(problem.whole(member), float(start.z[place]) if is_placed else None))
+        some = {m: unit for m, unit in units.items() if problem.candidate(m).effect.amplitudes and m not in combination
+                and problem.candidate(m).effect is not HIDDEN}  # fmt: skip
+        if not some:
+            return []
+        regression = Regression(w.stepper, fits, w.rows, w.found.priors, some)
+        return regression.subsets(size + len(w.base), w.found.estimates.__contains__, number)
+
+    def _scanned(self, fits: Fits, most: int) -> list[Start]:
+        w, (combination,), (z,) = self.weigher, fits.combinations, fits.z
+        grams = on_trajectory(w.stepper, fits, 0, w.rows)
+        sharp = sharp_units(w.stepper, fits, w.rows, w.found.priors)
+        wrong = noise_starts(w.problem, fits, w.rows)
+        return wrong + scan(w.problem, grams, z, combination, w.found.priors, self._units(most, sharp), sharp)
+
+    def _fitted(self, combination: Combination) -> Fits | None:
+        """A combination as it was fitted; None where it ran away."""
+        w, white = self.weigher, self.weigher.found.of(combination, "white")
+        assert white is not None
+        weight = weights(w.problem, w.rows)
+        predictions = w.stepper.predict(white.z[None], [combination], w.rows)
+        noise = estimate_noise(w.problem, [combination], residuals(w.problem, predictions, weight), weight)
+        fits = Fits([combination], white.z[None], noise, predictions, np.zeros(1), np.ones(1, bool))
+        return fits if np.isfinite(noise).all() else None
+
+    def _units(self, most: int, sharp: Mapping[int, list[Unit]] | None = None) -> list[Unit]:
+        """What is tried: every effect and target at its `sharp` places, or at all, thinned to so many at most."""
+        problem, out = self.weigher.problem, list[Unit]()
+        substeps = sum(self.weigher.rows) * int(problem.rows[0].spans.pieces[0])
+        load = substeps * (1 if problem.equations.separable else _NONSEPARABLE) / _CHEAP
+        most = max(_LEAST, int(most / max(1.0, load)))
+        for c in problem.searched:
+            units = (sharp or {}).get(c) or grid(problem, self.weigher.found.priors, c)
+            out += units[:: max(1, -(-len(units) // most))]
+        return out
+
+
+def promising(scanned: Sequence[Start], reach: float, share: float, most: int) -> list[Start]:
+    """Of what was looked at about one motion, at most so many that promise nearly as much as the best.
+
+    Nearly: within `reach` nats, or a `share`, since the farther off that motion is, the less exact are promises.
+    """
+    ranked = sorted(scanned, key=lambda start: -start.gain)[:most]
+    return [s for s in ranked if s.gain > ranked[0].gain - max(reach, share * ranked[0].gain)]
