@@ -7,14 +7,16 @@ import numpy as np
 from jaxtyping import Float
 
 from ._along import along, along_all, force, readings, velocity
-from ._calibrate import Fits, Priors, calibrate, grow, residuals, weights
+from ._calibrate import Fits, Priors, calibrate, residuals, weights
 from ._effect_priors import rms
 from ._problem import Problem
 from ._trajectory import Stepper
 
-# Starts tried for the initial states, and the spread of the random ones.
-_STARTS = 16
+# Starts tried for the initial states over a few rows, those of them that are followed on, and how far they are spread.
+_TRIED, _STARTS = 64, 16
 _SPREADS = (1e-3, 0.1, 1.0, 10.0)
+# Rows of the first windows, at least so many.
+_SHORT = (8, 14)
 # Where nothing is known: this many times the size of what was found.
 _WIDE = 10.0
 # Relative round-off of forces a whole turn on.
@@ -53,22 +55,35 @@ def windows(rows: Sequence[int], fractions: Sequence[float], least: int) -> list
 
 
 def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
-    """Calibrate initial states, then everything, in short windows from many starts; the best lane comes first."""
+    """Calibrate initial states, then everything, in short windows from many starts; the best lane comes first.
+
+    A few rows first: where not everything is read, or the forces are singular, a trajectory from a start that is far
+    off soon has nothing to do with the recording.
+    """
     problem = stepper.problem
-    short = windows(rows, (0.02, 0.04, 0.08), max(8, 4 * problem.state))
-    rng = np.random.default_rng(0)
-    z = np.tile(priors.mean, (_STARTS, 1))
-    spread = np.resize(np.repeat(_SPREADS, _STARTS // len(_SPREADS)), _STARTS)
-    noise = rng.normal(size=(_STARTS, problem.head)) * spread[:, None]
-    given = np.tile(np.where(np.isfinite(problem.initial.sd), problem.initial.sd, 0.0), len(problem.rows))
-    unknown = np.tile(np.isinf(problem.initial.sd), len(problem.rows))
-    z[:, : problem.head] += np.where(unknown, noise, given * noise / spread[:, None])
+    short = [[min(n, least) for n in rows] for least in _SHORT]
+    short += windows(rows, (0.02, 0.04, 0.08), max(_SHORT[0], 4 * problem.state))
     tight = _tightened(problem, priors)
-    fits = calibrate(stepper, z, [()] * _STARTS, tight, short[0], 40)
-    fits = grow(stepper, _recombined(problem, fits, short[0]), fits.combinations, priors, short[1:])
+    fits = calibrate(stepper, _scattered(problem, priors), [()] * _TRIED, tight, short[0], 40)
+    for number, window in enumerate(short[1:], 1):
+        z = _recombined(problem, fits, short[number - 1])[:_STARTS]
+        held = tight if number < len(_SHORT) + 1 else priors
+        fits = calibrate(stepper, z, [()] * _STARTS, held, window, 40)
     order = np.argsort(np.where(np.isfinite(fits.cost), _likelihood(problem, fits, short[-1]), np.inf))
     z = np.stack([without_turns(problem, z) for z in fits.z[order]])
     return Fits([()] * _STARTS, z, fits.noise[order], [], fits.cost[order], fits.converged[order])
+
+
+def _scattered(problem: Problem, priors: Priors) -> Float[np.ndarray, "lane z"]:
+    """Prior means with initial states drawn from their priors, or about them where nothing is known."""
+    rng = np.random.default_rng(0)
+    z = np.tile(priors.mean, (_TRIED, 1))
+    spread = np.resize(_SPREADS, _TRIED)
+    noise = rng.normal(size=(_TRIED, problem.head))
+    given = np.tile(np.where(np.isfinite(problem.initial.sd), problem.initial.sd, 0.0), len(problem.rows))
+    unknown = np.tile(np.isinf(problem.initial.sd), len(problem.rows))
+    z[:, : problem.head] += np.where(unknown, noise * spread[:, None], given * noise)
+    return z
 
 
 def without_turns(problem: Problem, z: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
