@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.special import erfcx
 from scipy.stats import multivariate_normal, norm
 
 # Probabilities of a half space below this are as good as impossible.
@@ -32,15 +33,19 @@ def laplace(
     precision: Float[np.ndarray, " z"],
     active: Bool[np.ndarray, " z"],
     lower: dict[int, float],
+    bounds: tuple[Float[np.ndarray, " z"], Float[np.ndarray, " z"]] = (np.array(-np.inf), np.array(np.inf)),
 ) -> Laplace:
     """Integrate exp(offset - |e0 - E d|^2 / 2) times the priors over the step d, exactly where e is linear.
 
     **Arguments:** - `gram`: of the columns [e0, E]. - `offset`: minus half of what does not depend on d. - `lower`: the
-    entries of z that are physical only above a bound; prior and posterior are cut off there.
+    entries of z that are physical only above a bound; prior and posterior are cut off there. - `bounds`: what no fit
+    leaves. An entry that stands at one and is pushed against it takes no step; what lies inside is integrated.
     """
-    a = np.nonzero(active)[0]
+    slope = gram[0, 1:] - precision * (z - mean)
+    pushed = active & ((z <= bounds[0]) & (slope < 0) | (z >= bounds[1]) & (slope > 0))
+    a = np.nonzero(active & ~pushed)[0]
     matrix = gram[1:, 1:][np.ix_(a, a)] + np.diag(precision[a])
-    vector = gram[0, 1:][a] - precision[a] * (z - mean)[a]
+    vector = slope[a]
     diagonal = np.diag(matrix)
     scale = np.sqrt(np.where(diagonal > _TINY, diagonal, 1.0))
     scaled = matrix / np.outer(scale, scale)
@@ -59,8 +64,19 @@ def laplace(
     full_step, covariance = np.zeros(len(z)), np.zeros((len(z), len(z)))
     full_step[a] = step
     covariance[np.ix_(a, a)] = inverse
+    for k in np.nonzero(pushed)[0]:
+        cross = gram[1:, 1:][a, k]
+        bend = max(gram[1 + k, 1 + k] + precision[k] - float(cross @ inverse @ cross), _TINY)
+        mass, covariance[k, k] = _beyond(abs(slope[k] - float(cross @ full_step[a])), bend)
+        value += mass + 0.5 * np.log(precision[k] / (2 * np.pi)) - 0.5 * precision[k] * (z[k] - mean[k]) ** 2
     value += _half_spaces(z + full_step, covariance, mean, precision, lower)
     return Laplace(float(value) if np.isfinite(value) else -np.inf, full_step, covariance, promised)
+
+
+def _beyond(slope: float, bend: float) -> tuple[float, float]:
+    """Log of the integral of exp(-slope u - bend u^2 / 2) over all positive u, and about the variance of u."""
+    mass = 0.5 * np.log(np.pi / (2 * bend)) + np.log(erfcx(slope / np.sqrt(2 * bend)))
+    return float(mass), 1.0 / (slope**2 + bend)
 
 
 def _half_spaces(

@@ -173,7 +173,8 @@ def _integrated(problem: Problem, fit: PathFit, passes, priors: Priors, weight) 
         return Laplace(-np.inf, np.zeros(problem.size), np.zeros((problem.size, problem.size)), 0.0)
     precision = priors.precision_of(problem, fit.combination)
     return laplace(gram, offset, fit.z, priors.mean_of(problem, fit.combination), precision,
-                   problem.active(fit.combination), problem.lower_bounds(fit.combination))  # fmt: skip
+                   problem.active(fit.combination), problem.lower_bounds(fit.combination),
+                   priors.bounds_of(problem, fit.combination))  # fmt: skip
 
 
 def lane_grams(

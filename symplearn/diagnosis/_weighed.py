@@ -159,7 +159,8 @@ def _laplace(problem: Problem, combination: Combination, gram, offset: float, z,
         return Laplace(-np.inf, np.zeros(problem.size), np.zeros((problem.size, problem.size)), 0.0)
     precision = priors.precision_of(problem, combination)
     active, lower = problem.active(combination), problem.lower_bounds(combination)
-    return laplace(gram, offset, z, priors.mean_of(problem, combination), precision, active, lower)
+    bounds = priors.bounds_of(problem, combination)
+    return laplace(gram, offset, z, priors.mean_of(problem, combination), precision, active, lower, bounds)
 
 
 def standardised(r: list[np.ndarray], weight: list[np.ndarray], noise: np.ndarray) -> Float[np.ndarray, "row channel"]:

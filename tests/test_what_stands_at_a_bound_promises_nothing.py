@@ -1,0 +1,63 @@
+"""A fit that rests against a bound is integrated inside it: what a step through the bound would gain is not earned."""
+
+import numpy as np
+import pytest
+from scipy.integrate import dblquad, quad
+
+from symplearn.diagnosis._evidence import laplace
+
+RNG = np.random.default_rng(3)
+COLUMNS = RNG.normal(size=(2, 30))
+MEAN, SD = np.array([0.5, 2.0]), np.array([1.5, 1.2])
+FREE = (np.full(2, -np.inf), np.full(2, np.inf))
+
+
+def log_density(error, z, begin):
+    """Unnormalised log likelihood of a linear model that was fitted at `begin`, and the log of normal priors."""
+    left = error - (z - begin) @ COLUMNS
+    prior = -0.5 * ((z - MEAN) / SD) ** 2 - 0.5 * np.log(2 * np.pi * SD**2)
+    return -0.5 * float(left @ left) + float(prior.sum())
+
+
+def evaluated(error, begin, bounds, active=(True, True)):
+    columns = np.concatenate([error[None], COLUMNS])
+    return laplace(columns @ columns.T, 0.0, begin, MEAN, SD**-2.0, np.array(active), {}, bounds)
+
+
+@pytest.mark.parametrize("push", [-0.3, -2.0, -8.0])
+@pytest.mark.parametrize("side", [0, 1])
+def test_one_entry_is_integrated_on_the_side_that_is_left(push, side):
+    """Of one free entry, pushed weakly or hard against a lower or an upper bound: SciPy's quadrature."""
+    begin, sign = np.array([1.0, 2.0]), 1 - 2 * side
+    error = sign * push * COLUMNS[0] / (COLUMNS[0] @ COLUMNS[0]) * 3
+    bounds = tuple(bound.copy() for bound in FREE)
+    bounds[side][0] = begin[0]
+    found = evaluated(error, begin, bounds, (True, False))
+    top = log_density(error, begin, begin)
+    inside = (begin[0], np.inf) if side == 0 else (-np.inf, begin[0])
+    mass, _ = quad(lambda x: np.exp(log_density(error, np.array([x, begin[1]]), begin) - top), *inside)
+    held = -0.5 * ((begin[1] - MEAN[1]) / SD[1]) ** 2 - 0.5 * np.log(2 * np.pi * SD[1] ** 2)
+    assert found.log_evidence == pytest.approx(top + np.log(mass) - held, abs=1e-6)
+    assert found.promised == 0.0 and not found.step.any()
+    assert found.covariance[0, 0] > 0
+
+
+def test_the_others_follow():
+    """Beside an entry at its bound a free one takes its step; the evidence is that of the half plane."""
+    begin = np.array([1.0, 2.0])
+    error = -9.0 * COLUMNS[0] / (COLUMNS[0] @ COLUMNS[0]) + 0.4 * COLUMNS[1]
+    bounds = (np.array([1.0, -np.inf]), FREE[1])
+    found = evaluated(error, begin, bounds)
+    top = log_density(error, begin, begin)
+    mass, _ = dblquad(lambda y, x: np.exp(log_density(error, np.array([x, y]), begin) - top), 1.0, 4.0, -2.0, 6.0)
+    assert found.log_evidence == pytest.approx(top + np.log(mass), abs=1e-5)
+    assert found.step[0] == 0.0 and found.step[1] > 0.1
+
+
+def test_inside_its_bounds_nothing_changes():
+    """An entry between its bounds, or pushed away from one, is integrated as if there were none."""
+    begin = np.array([1.0, 2.0])
+    error = 5.0 * COLUMNS[0] / (COLUMNS[0] @ COLUMNS[0])
+    free = evaluated(error, begin, FREE)
+    assert evaluated(error, begin, (np.array([0.9, -np.inf]), FREE[1])).log_evidence == free.log_evidence
+    assert evaluated(error, begin, (np.array([1.0, -np.inf]), FREE[1])).log_evidence == free.log_evidence
