@@ -264,12 +264,14 @@ class Search:
         """
         scanned = self.prospects.about(self.base, _MANY)
         if self._is_near(0):
-            self.weigher.weigh(promising(scanned, np.inf, 0.0, _SMALL), whole=True)
+            if small := promising(scanned, np.inf, 0.0, _SMALL):
+                self.weigher.weigh(small, whole=True)
             return
         along = promising(self.prospects.along(self._null, _FEW), _REACH, _VAGUE, _FIRST)
         first = promising(scanned, _REACH, _VAGUE, _FIRST) + [s for s in along if self._new(s).effect.places]
-        self.progress(f"weighing {len({s.combination for s in first})} likely effects")
-        self.weigher.weigh([s if self._new(s).effect.places else self._from_nothing(s.combination) for s in first])
+        if first:
+            self.progress(f"weighing {len({s.combination for s in first})} likely effects")
+            self.weigher.weigh([s if self._new(s).effect.places else self._from_nothing(s.combination) for s in first])
         if (best := self._adequate()) is not None:
             self._weigh_exchanged(best, 1, _SMALL)
             return
@@ -282,7 +284,8 @@ class Search:
 
     def _weigh_in_batches(self, starts: Sequence[Start], whole: bool = False) -> None:
         """As many as there is time for."""
-        self.progress(f"weighing {len({s.combination for s in starts})} combinations")
+        if starts:
+            self.progress(f"weighing {len({s.combination for s in starts})} combinations")
         for a in range(0, len(starts), _BATCH):
             if self._in_time():
                 self.weigher.weigh(starts[a : a + _BATCH], whole=whole)
@@ -290,10 +293,15 @@ class Search:
     def _adequate(self) -> Combination | None:
         """A single effect that follows the recording as no remainder does beside it or instead of it."""
         alone = [c for c in self.found.estimates if self._size(c) == 1]
-        best = max(alone, key=self.found.best)
+        best = max(alone, key=self.found.best, default=self.base)
         white = self.found.of(best, "white")
         rest = max(self.found.best(self.base), self._null.log_evidence)
-        if white is None or not white.converged or any(self.problem.candidate(m).effect is NOISE for m in best):
+        if (
+            not alone
+            or white is None
+            or not white.converged
+            or any(self.problem.candidate(m).effect is NOISE for m in best)
+        ):
             return None
         is_white = white.log_evidence > self.found.best(best) - _WORTH
         return best if is_white and white.log_evidence > rest + _REACH else None
