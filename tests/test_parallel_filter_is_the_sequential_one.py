@@ -63,11 +63,11 @@ CASES = {
         np.eye(2), np.cumsum(RANDOM.uniform(0.5, 2.0, 37)), RANDOM.normal(size=(37, 1)), np.array([[0.0], [1.0]]),
         np.array([[0.3], [-1.0]]),
     ),
+}  # fmt: skip
+MORE = {
     "a known start, and a state without noise": Case(
         TURN, np.ones((1, 2)), np.diag([0.0, 0.2]), readings(13, 1), np.zeros((2, 2))
     ),
-}  # fmt: skip
-MORE = {
     "one reading": Case(TURN, np.eye(2)[:1], np.eye(2), readings(1, 1), np.eye(2)),
     "two readings": Case(TURN, np.eye(2)[:1], np.eye(2), readings(2, 1), np.eye(2)),
     "more channels than states, growing, of any start": Case(
@@ -103,13 +103,13 @@ def scored(case, passage):
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_score_slopes_and_moments_are_the_sequential_ones(case):
-    """To 1e-10: likelihood, gradient, predicted and filtered moments, innovations; with gaps, inputs, no noise."""
+    """To 1e-10: likelihood, gradient, predicted and filtered moments, innovations; with gaps and inputs."""
     same(scored(case, PARALLEL), scored(case, SEQUENTIAL))
 
 
 @pytest.mark.parametrize("case", MORE.values(), ids=MORE)
 def test_recordings_of_any_size_are_filtered_alike(case):
-    """To 1e-10: likelihood and moments of one reading, of two, of a thousand; from a start that is all but unknown."""
+    """To 1e-10: likelihood and moments of one reading, of two, of a thousand; from a start that is known, or all but unknown."""
     found = (jax.jit(lambda x, p=passage: history(case, p, x))(jnp.ones(3)) for passage in (PARALLEL, SEQUENTIAL))
     same(*([one] for one in found))
 
