@@ -109,7 +109,7 @@ def test_score_slopes_and_moments_are_the_sequential_ones(case):
 
 @pytest.mark.parametrize("case", MORE.values(), ids=MORE)
 def test_recordings_of_any_size_are_filtered_alike(case):
-    """To 1e-10: likelihood and moments of one reading, two, a thousand; from a start that is known or all but unknown."""
+    """To 1e-10: likelihood and moments of one reading, two, a thousand; from a start known or all but unknown."""
     found = (jax.jit(lambda x, p=passage: history(case, p, x))(jnp.ones(3)) for passage in (PARALLEL, SEQUENTIAL))
     same(*([one] for one in found))
 
