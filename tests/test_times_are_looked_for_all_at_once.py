@@ -8,6 +8,7 @@ import pytest
 
 from symplearn.diagnosis import _tangent as tangent
 from symplearn.diagnosis._calibrate import calibrate
+from symplearn.diagnosis._scan import spacing
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
 
@@ -152,7 +153,12 @@ def test_the_best_time_is_that_of_the_blow(stepper, priors, fits):
     assert found[one_of(p, "impulse")][0].place == pytest.approx(BLOW[1], abs=np.diff(TIMES[1])[0])
     assert {p.candidate(m).effect.name for m in found} == {
         "impulse", "regime_change", "periodic_forcing", "parametric_modulation"}  # fmt: skip
-    assert all(0 < len(units) <= 8 for units in found.values())
+    for m, units in found.items():
+        one = p.candidate(m)
+        ends = (priors.lower[one.values.stop - 1], priors.upper[one.values.stop - 1])
+        assert 0 < len(units) <= 8
+        # None is the slope of another's peak: as far apart as neighbours on a grid, and half as far again.
+        assert (np.diff(sorted(u.place for u in units)) >= 1.5 * spacing(one, *ends) * (1 - 1e-9)).all()
 
 
 def test_what_ran_away_is_not_drawn_back(stepper, priors, fits):

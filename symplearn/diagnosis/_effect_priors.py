@@ -140,8 +140,11 @@ def _pair_unit(motion: Motion, one: Candidate) -> tuple[float, ...]:
 
 def _range(motion: Motion, one: Candidate) -> tuple[float, float]:
     """Where an effect's place may lie."""
-    if isinstance(one.effect, Oscillating) or one.effect is effects.HIDDEN:
+    if isinstance(one.effect, Oscillating):
         return motion.frequencies
+    if one.effect is effects.HIDDEN:  # which its start shows where it has swung but half a cycle
+        low, high = motion.frequencies
+        return low / 2, high
     if one.effect is effects.STOP:
         low, middle, high = np.nanquantile(motion.q[:, one.place], [0.0, 0.5, 1.0])
         return (float(middle), float(high)) if one.side == "upper" else (float(low), float(middle))

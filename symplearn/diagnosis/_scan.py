@@ -36,10 +36,11 @@ def grid(problem: Problem, priors: Priors, candidate: int) -> list[Unit]:
 
 def _places(one: Candidate, low: float, high: float) -> np.ndarray:
     if isinstance(one.effect, Oscillating) or one.effect is effects.HIDDEN:
-        number = int(min(_FREQUENCIES, np.ceil((high - low) / (_SPACING * low))))
+        step = spacing(one, low, high)
+        number = int(min(_FREQUENCIES, np.ceil((high - low) / step)))
         # Evenly spaced as far as they go, which is what the span resolves; then ever wider.
         even = np.linspace(low, high, number)
-        return even if high - low <= _SPACING * low * _FREQUENCIES else np.geomspace(low, high, number)
+        return even if high - low <= step * _FREQUENCIES else np.geomspace(low, high, number)
     number = _THRESHOLDS if one.effect is effects.STOP else _TIMES
     return low + (high - low) * (np.arange(number) + 0.5) / number
 
@@ -47,7 +48,7 @@ def _places(one: Candidate, low: float, high: float) -> np.ndarray:
 def spacing(one: Candidate, low: float, high: float) -> float:
     """About how far apart neighbouring places are."""
     if isinstance(one.effect, Oscillating) or one.effect is effects.HIDDEN:
-        return _SPACING * low
+        return _SPACING * low * (2 if one.effect is effects.HIDDEN else 1)
     return (high - low) / (_THRESHOLDS if one.effect is effects.STOP else _TIMES)
 
 

@@ -27,8 +27,8 @@ from ._weigher import KEPT, Weigher
 _REACH = 30.0
 # Combinations that are extended, most larger ones that are fitted, and what a larger one must gain to go on.
 _BASES, _PAIRS, _WORTH = 4, 32, 2.0
-# How many effects are fitted where they are small.
-_SMALL = 24
+# How many effects are fitted where they are small, and how often the same at other places or in other recordings.
+_SMALL, _ALIKE = 24, 4
 # Share of a promise that may be wrong.
 _VAGUE = 0.3
 # Effects that are fitted first, of the highest scores.
@@ -264,7 +264,7 @@ class Search:
         """
         scanned = self.prospects.about(self.base, _MANY)
         if self._is_near(0):
-            if small := promising(scanned, np.inf, 0.0, _SMALL):
+            if small := self._varied(scanned):
                 self.weigher.weigh(small, whole=True)
             return
         along = promising(self.prospects.along(self._null, _FEW), _REACH, _VAGUE, _FIRST)
@@ -278,6 +278,17 @@ class Search:
         plain = [self._with(c) for c in self.problem.searched if not self.problem.candidate(c).effect.places
                  and self.problem.candidate(c).effect is not OUTLIERS]  # fmt: skip
         self._weigh_in_batches([self._from_nothing(c) for c in plain if c not in self.found.estimates])
+
+    def _varied(self, scanned: Sequence[Start]) -> list[Start]:
+        """The best starts, not too many of one effect and target, whatever their places and recordings."""
+        kept: dict[int, list[Start]] = {}
+        ranked = sorted(scanned, key=lambda start: -start.gain)
+        for start in ranked:
+            (member,) = set(start.combination) - set(self.base)
+            alike = kept.setdefault(self.problem.whole(member), [])
+            if len(alike) < _ALIKE and sum(map(len, kept.values())) < _SMALL:
+                alike.append(start)
+        return [start for alike in kept.values() for start in alike]
 
     def _from_nothing(self, combination: Combination) -> Start:
         return Start(combination, self._from_seed(), 0.0)

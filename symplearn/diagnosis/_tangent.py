@@ -15,7 +15,7 @@ from jaxtyping import Float
 from .. import _effects as effects
 from ._calibrate import Fits, Priors, residuals, weights
 from ._problem import Problem
-from ._scan import BEST, grid, layout, packed
+from ._scan import BEST, grid, layout, packed, spacing
 from ._score import Unit
 from ._trajectory import Stepper
 
@@ -23,6 +23,8 @@ from ._trajectory import Stepper
 _SUDDEN, _PERIODIC = (effects.IMPULSE, effects.REGIME), (effects.FORCING, effects.MODULATION)
 # Places kept for each effect and target, of all choices of recordings; times that are looked at.
 _KEPT, _TIMES = 8, 400
+# Of the distance of a grid's neighbours, how far apart those are at least.
+_APART = 1.5
 # How far Phi Phi^-1 may be from one; beyond, the trajectory is too chaotic to be drawn back to its start.
 _EXACT = 1e-6
 # Of what is left of a square after a projection.
@@ -110,6 +112,8 @@ def _best(problem: Problem, recordings: Sequence[_Recording], priors: Priors, ca
     places = _places(problem, recordings, priors, candidate)
     sums = [_sums(problem, own, candidate, places) for own in recordings]
     scales = priors.scales[one.first : one.first + one.effect.amplitudes]
+    ends = priors.lower[one.values.stop - 1], priors.upper[one.values.stop - 1]
+    apart = _APART * spacing(one, *map(float, ends))
     found: dict[int, float] = {}
     for member in [candidate, *problem.variants(candidate)]:
         which = problem.members[member].recordings
@@ -119,16 +123,22 @@ def _best(problem: Problem, recordings: Sequence[_Recording], priors: Priors, ca
         for r in which[1:]:
             mine = mine + sums[r]
         gains = np.nan_to_num(mine.gains(scales), nan=-np.inf, posinf=-np.inf)
-        for k in _peaks(gains):
+        for k in _peaks(gains, places, apart)[:BEST]:
             found[k] = max(found.get(k, -np.inf), float(gains[k]))
-    return [float(places[k]) for k in sorted(found, key=lambda k: -found[k])[:_KEPT]]
+    every = np.full(len(places), -np.inf)
+    every[list(found)] = list(found.values())
+    return [float(places[k]) for k in _peaks(every, places, apart)[:_KEPT]]
 
 
-def _peaks(gains: Float[np.ndarray, " place"]) -> list[int]:
-    """The best places that are no neighbours of a better one."""
-    padded = np.concatenate([[-np.inf], gains, [-np.inf]])
-    peak = np.nonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:]) & np.isfinite(gains))[0]
-    return [int(k) for k in peak[np.argsort(-gains[peak], kind="stable")][:BEST]]
+def _peaks(gains: Float[np.ndarray, " place"], places: Float[np.ndarray, " place"], apart: float) -> list[int]:
+    """The best places, best first, none within `apart` of a better one."""
+    kept: list[int] = []
+    for k in np.argsort(-gains, kind="stable"):
+        if not np.isfinite(gains[k]) or len(kept) == _KEPT:
+            break
+        if all(abs(places[k] - places[j]) >= apart for j in kept):
+            kept.append(int(k))
+    return kept
 
 
 def _places(problem: Problem, recordings: Sequence[_Recording], priors: Priors, candidate: int) -> np.ndarray:
