@@ -14,8 +14,8 @@ MOTION = Motion(np.sin(T)[:, None], np.cos(T)[:, None], np.ones(1), np.ones(1), 
 
 @pytest.mark.parametrize(("name", "cycles"), [("hidden_oscillator", 0.5), ("periodic_forcing", 1.0)])
 def test_the_slowest_is_tried_and_the_rest_as_densely(name, cycles):
-    """From so many cycles in the recording to half the Nyquist frequency, no further apart than the span resolves, two pi
-    over it, and not much denser."""
+    """From so many cycles in the recording to half the Nyquist frequency, no further apart than the span resolves, two
+    pi over it, and not much denser."""
     low, high = _range(MOTION, candidate(name))
     assert (low, high) == pytest.approx((2 * np.pi * cycles / SPAN, np.pi / (2 * GAP)))
     tried = _places(candidate(name), low, high)
