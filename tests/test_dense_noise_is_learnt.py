@@ -57,6 +57,7 @@ def test_of_exact_readings_the_map_is_the_residuals_covariance():
     np.testing.assert_allclose(learn(0.0, series), most_probable(residuals.T @ residuals), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_truth_lies_within_its_standard_errors():
     """Over 12 noisy recordings the estimates scatter about the true matrix as the Wishart distribution says."""
     found = np.array([learn(0.01, recorded(0.01, seed)[1]) for seed in range(1, 13)])

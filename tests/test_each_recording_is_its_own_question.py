@@ -20,6 +20,7 @@ def answer(folder):
     return document["verdict"], document["probability"], document["findings"], document["fit"]
 
 
+@pytest.mark.slow
 def test_each_is_answered_as_alone_and_kept(command, tmp_path):
     """Two recordings get their own reports, a broken one its sentence; again, only the broken one is read."""
     simulation, damped_one = write_case(tmp_path)

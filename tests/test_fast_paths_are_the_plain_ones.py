@@ -91,7 +91,11 @@ def test_leapfrog_over_many_steps_is_its_steps(system):
     ("system", "integrator"),
     [
         (sl.PolynomialPotential(2, 3, 0.1 * np.arange(9.0)), ig.Leapfrog()),
-        (sl.PolynomialPotential(2, 4, 0.1 * np.arange(14.0), sl.Legendre((1.5, 2.0))), ig.yoshida4(ig.Leapfrog())),
+        pytest.param(
+            sl.PolynomialPotential(2, 4, 0.1 * np.arange(14.0), sl.Legendre((1.5, 2.0))),
+            ig.yoshida4(ig.Leapfrog()),
+            marks=pytest.mark.slow,
+        ),
         (sl.Polynomial(1, 3, 0.1 * np.sin(np.arange(9.0))), ig.Tao()),
         (sl.Polynomial(1, 2, 0.1 * np.arange(5.0)), ig.Tao(projection=ig.FirstCopy())),
         (HenonHeiles(), ig.RK2()),

@@ -160,6 +160,7 @@ def faulty(x, passage):
     return filtered.log_likelihood, filtered
 
 
+@pytest.mark.slow
 def test_faults_are_the_sequential_ones():
     """An escape, a negative variance, a singular innovation, readings too far away: same fault, reading, score and
     slopes, those by the readings among them, without NaN."""

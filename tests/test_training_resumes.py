@@ -63,7 +63,7 @@ def same(one, other):
     return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(*leaves, strict=True))
 
 
-@pytest.mark.parametrize("name", ["likelihood", "batches"])
+@pytest.mark.parametrize("name", [pytest.param("likelihood", marks=pytest.mark.slow), "batches"])
 def test_loss_falls_and_the_record_says_how(name):
     """The score falls by much, the history holds the score of every epoch, and the record calls itself no MAP."""
     found = uninterrupted(name)
