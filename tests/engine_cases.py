@@ -59,3 +59,12 @@ def solved(rates: Callable, start: Sequence[float], times: np.ndarray, tolerance
     found = solve_ivp(rates, span, start, "DOP853", times, rtol=tolerance, atol=tolerance * 1e-2)
     assert found.success, found.message
     return found.y.T
+
+
+def struck(
+    rates: Callable, start: Sequence[float], times: np.ndarray, jump: Sequence[float], when: float
+) -> np.ndarray:
+    """The same (time, state) with a jump of the state at `when`, inside the times; a row there shows it just after."""
+    now = solved(rates, start, np.append(times[times < when], when))
+    after = solved(rates, now[-1] + jump, np.append(when, times[times > when]))
+    return np.concatenate([now[:-1], after[0 if (times == when).any() else 1 :]])

@@ -40,11 +40,7 @@ def response(times, push=lambda t: 0.0, start=(0.0, 0.0), jump=None):
     rates = lambda t, x: [x[1] / MASS, -STIFFNESS * x[0] + push(t)]  # noqa: E731
     if jump is None:
         return cases.solved(rates, start, times)[:, 0]
-    size, when = jump
-    early, late = np.append(times[times < when], when), np.append(when, times[times >= when])
-    before = cases.solved(rates, start, early)
-    after = cases.solved(rates, before[-1] + [0.0, size], late)
-    return np.concatenate([before[:-1, 0], after[1:, 0]])
+    return cases.struck(rates, start, times, [0.0, jump[0]], jump[1])[:, 0]
 
 
 def made(seed, number, forcing=(0.0, 1.0, 0.0), jump=None):

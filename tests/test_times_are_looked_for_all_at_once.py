@@ -37,11 +37,7 @@ def angles(times, start, push=lambda t: 0.0, gravity=lambda t: GRAVITY, blow=(0.
     size, when = blow
     if not (size and times[0] < when < times[-1]):
         return cases.solved(rates, start, times)[:, 0]
-    early, late = np.append(times[times < when], when), np.append(when, times[times > when])
-    before = cases.solved(rates, start, early)
-    after = cases.solved(rates, before[-1] + [0.0, size], late)
-    now = before[-1:, 0] if (times == when).any() else []
-    return np.concatenate([before[:-1, 0], now, after[1:, 0]])
+    return cases.struck(rates, start, times, [0.0, size], when)[:, 0]
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +155,14 @@ def test_the_best_time_is_that_of_the_blow(stepper, priors, fits):
         assert 0 < len(units) <= 8
         # None is the slope of another's peak: as far apart as neighbours on a grid, and half as far again.
         assert (np.diff(sorted(u.place for u in units)) >= 1.5 * spacing(one, *ends) * (1 - 1e-9)).all()
+
+
+def test_blows_are_looked_for_alone(stepper, priors, fits):
+    """A search restricted to blows finds the same best time, though nothing that acts all the time is searched."""
+    m, rows = one_of(stepper.problem, "impulse"), [len(t) for t in TIMES]
+    (best, *_) = tangent.sharp_units(stepper, fits, rows, priors)[m]
+    alone = tangent.sharp_units(stepper.on(replace(stepper.problem, searched=(m,))), fits, rows, priors)
+    assert set(alone) == {m} and alone[m][0] == best
 
 
 def test_what_ran_away_is_not_drawn_back(stepper, priors, fits):

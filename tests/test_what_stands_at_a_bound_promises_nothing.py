@@ -19,9 +19,9 @@ def log_density(error, z, begin):
     return -0.5 * float(left @ left) + float(prior.sum())
 
 
-def evaluated(error, begin, bounds, active=(True, True)):
+def evaluated(error, begin, bounds, active=(True, True), precision=SD**-2.0):
     columns = np.concatenate([error[None], COLUMNS])
-    return laplace(columns @ columns.T, 0.0, begin, MEAN, SD**-2.0, np.array(active), {}, bounds)
+    return laplace(columns @ columns.T, 0.0, begin, MEAN, precision, np.array(active), {}, bounds)
 
 
 @pytest.mark.parametrize("push", [-0.3, -2.0, -8.0])
@@ -37,6 +37,7 @@ def test_one_entry_is_integrated_on_the_side_that_is_left(push, side):
     inside = (begin[0], np.inf) if side == 0 else (-np.inf, begin[0])
     mass, _ = quad(lambda x: np.exp(log_density(error, np.array([x, begin[1]]), begin) - top), *inside)
     held = -0.5 * ((begin[1] - MEAN[1]) / SD[1]) ** 2 - 0.5 * np.log(2 * np.pi * SD[1] ** 2)
+    # SciPy's quadrature is good to 1e-8 of the mass.
     assert found.log_evidence == pytest.approx(top + np.log(mass) - held, abs=1e-6)
     assert found.promised == 0.0 and not found.step.any()
     assert found.covariance[0, 0] > 0
@@ -50,8 +51,20 @@ def test_the_others_follow():
     found = evaluated(error, begin, bounds)
     top = log_density(error, begin, begin)
     mass, _ = dblquad(lambda y, x: np.exp(log_density(error, np.array([x, y]), begin) - top), 1.0, 4.0, -2.0, 6.0)
+    # The quadrature ends at 4, -2 and 6, and is good to 1e-8 of what is inside.
     assert found.log_evidence == pytest.approx(top + np.log(mass), abs=1e-5)
     assert found.step[0] == 0.0 and found.step[1] > 0.1
+
+
+def test_an_entry_without_a_prior_has_an_evidence_at_its_bound():
+    """A calibrated value of flat prior owes no more than it does inside: the evidence is finite, and that of a bound
+    which is hardly pushed against is half of the free one."""
+    begin, flat = np.array([1.0, 2.0]), np.array([0.0, SD[1] ** -2.0])
+    error = -1e-9 * COLUMNS[0]
+    at_bound = evaluated(error, begin, (np.array([1.0, -np.inf]), FREE[1]), (True, False), flat)
+    free = evaluated(error, begin, FREE, (True, False), flat)
+    # The push of 1e-9 moves it by as much.
+    assert at_bound.log_evidence == pytest.approx(free.log_evidence - np.log(2), abs=1e-6)
 
 
 def test_inside_its_bounds_nothing_changes():

@@ -250,6 +250,27 @@ def normal_equations(
     return matrix, vector
 
 
+def by_the_noise(
+    problem: Problem, fits: Fits, rows: Sequence[int]
+) -> tuple[Float[np.ndarray, " reading"], Float[np.ndarray, "z reading"]]:
+    """Errors of all readings of a fit of one lane, and their slopes in every unknown, recordings end to end."""
+    weight = weights(problem, rows)
+    errors, slopes = [], []
+    roots = noise_roots(weight, fits)
+    for r, (x, root) in enumerate(zip(residuals(problem, fits.predictions, weight), roots, strict=True)):
+        own = np.where(root > 0, fits.predictions[r].slopes[0], 0.0) * root
+        every = np.zeros((problem.size, root.size))
+        every[problem.local(r)] = own.reshape(len(own), -1)
+        errors.append((x[0] * root).ravel())
+        slopes.append(every)
+    return np.concatenate(errors), np.concatenate(slopes, axis=1)
+
+
+def noise_roots(weight: Sequence[np.ndarray], fits: Fits) -> list[Float[np.ndarray, "_ channel"]]:
+    """What a reading is to be multiplied by to be in units of the noise of a fit of one lane; 0 where there is none."""
+    return [np.where(w > 0, np.sqrt(w), 0.0) / fits.noise[0] for w in weight]
+
+
 def _steps(problem, fits: Fits, weight, precision, mean, active, bounds, damping) -> tuple[np.ndarray, np.ndarray]:
     """Damped Gauss-Newton steps, and what an undamped one promises to take off the cost."""
     with np.errstate(over="ignore", invalid="ignore"):

@@ -68,7 +68,8 @@ def laplace(
         cross = gram[1:, 1:][a, k]
         bend = max(gram[1 + k, 1 + k] + precision[k] - float(cross @ inverse @ cross), _TINY)
         mass, covariance[k, k] = _beyond(abs(slope[k] - float(cross @ full_step[a])), bend)
-        value += mass + 0.5 * np.log(precision[k] / (2 * np.pi)) - 0.5 * precision[k] * (z[k] - mean[k]) ** 2
+        width = np.log(precision[k]) if precision[k] > 0 else 0.0  # without a prior, as of `held`
+        value += mass + 0.5 * (width - np.log(2 * np.pi)) - 0.5 * precision[k] * (z[k] - mean[k]) ** 2
     value += _half_spaces(z + full_step, covariance, mean, precision, lower)
     return Laplace(float(value) if np.isfinite(value) else -np.inf, full_step, covariance, promised)
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._effects import HIDDEN
-from ._calibrate import Fits, Priors, residuals, weights
+from ._calibrate import Fits, Priors, by_the_noise, noise_roots, weights
 from ._problem import Combination, Problem
 from ._scan import layout, packed
 from ._score import Start, Unit, inverse
@@ -51,7 +51,8 @@ class Regression:
     def __init__(self, stepper: Stepper, fits: Fits, rows: Sequence[int], priors: Priors, units: dict[int, Unit]):
         self.problem, self.priors = stepper.problem, priors
         (self.combination,), (self.z,) = fits.combinations, fits.z
-        error, others, fitted = _about(self.problem, fits, rows)
+        error, others = by_the_noise(self.problem, fits, rows)
+        fitted = _fitted(self.problem, fits, others)
         self.responses = [*fitted, *_further(stepper, fits, rows, units)]
         # Held in every subset: what has no amplitude, and what brings unknowns of its own.
         self.kept = [k for k, one in enumerate(fitted) if not len(one.columns) or self._is_unseen(one.member)]
@@ -148,32 +149,18 @@ class Regression:
         return np.clip(z, *self.priors.bounds_of(self.problem, combination))
 
 
-def _about(problem: Problem, fits: Fits, rows: Sequence[int]) -> tuple[np.ndarray, np.ndarray, list[Response]]:
-    """Errors of all readings, their slopes in every unknown, and those of the fitted effects, by the noise."""
-    (combination,), weight = fits.combinations, weights(problem, rows)
-    errors, slopes = [], []
-    for r, (x, w) in enumerate(zip(residuals(problem, fits.predictions, weight), weight, strict=True)):
-        root = _roots(w, fits)
-        errors.append((x[0] * root).ravel())
-        own = np.where(w > 0, fits.predictions[r].slopes[0], 0.0) * root
-        every = np.zeros((problem.size, own[0].size))
-        every[problem.local(r)] = own.reshape(len(own), -1)
-        slopes.append(every)
-    joined = np.concatenate(slopes, axis=1)
-    fitted = []
-    for member, place in problem.placed(combination):
+def _fitted(problem: Problem, fits: Fits, slopes: Float[np.ndarray, "z reading"]) -> list[Response]:
+    """Responses to the effects of a fit."""
+    found = []
+    for member, place in problem.placed(fits.combinations[0]):
         amplitudes = slice(place.start, place.start + problem.candidate(member).effect.amplitudes)
-        fitted.append(Response(member, fits.z[0][place], joined[amplitudes]))
-    return np.concatenate(errors), joined, fitted
-
-
-def _roots(weight: np.ndarray, fits: Fits) -> np.ndarray:
-    return np.where(weight > 0, np.sqrt(weight), 0.0) / fits.noise[0]
+        found.append(Response(member, fits.z[0][place], slopes[amplitudes]))
+    return found
 
 
 def _further(stepper: Stepper, fits: Fits, rows: Sequence[int], units: dict[int, Unit]) -> list[Response]:
     """Responses to effects that are not part of the fit, each at its place and in its own recordings."""
-    problem, weight = stepper.problem, weights(stepper.problem, rows)
+    problem, roots = stepper.problem, noise_roots(weights(stepper.problem, rows), fits)
     unknown = problem.state + problem.calibrated.size
     several: dict[Unit, list[int]] = {}
     for member, unit in units.items():
@@ -186,8 +173,8 @@ def _further(stepper: Stepper, fits: Fits, rows: Sequence[int], units: dict[int,
         for b, lane in enumerate(some):
             for u, unit in enumerate(lane):
                 at = unknown + laid[b][2][u]
-                by_run = [(np.nan_to_num(slopes[r][b][at]) * _roots(w, fits)).reshape(len(at), -1)
-                          for r, w in enumerate(weight)]  # fmt: skip
+                by_run = [(np.nan_to_num(slopes[r][b][at]) * root).reshape(len(at), -1)
+                          for r, root in enumerate(roots)]  # fmt: skip
                 for member in several[unit]:
                     which = problem.members[member].recordings
                     columns = np.concatenate([x * (r in which) for r, x in enumerate(by_run)], axis=1)

@@ -12,10 +12,13 @@ from ._problem import Combination
 from ._scan import grid, noise_starts, on_path, on_trajectory, scan
 from ._score import Start, Unit
 from ._tangent import sharp_units
+from ._weighed import Estimate
 from ._weigher import Weigher
 
 # Effects of the highest scores that may take another's part, beside all those without a place.
 _EXCHANGED = 24
+# Starts about one motion that are fitted first, and the share of a promise that may be wrong.
+_FIRST, _VAGUE = 16, 0.3
 # Places at which an effect is tried at most; fewer where a trajectory costs more than one of so many leapfrog
 # substeps; how much more a substep of a nonseparable system costs.
 _LEAST = 10
@@ -28,6 +31,7 @@ class Prospects:
     def __init__(self, weigher: Weigher):
         self.weigher = weigher
         self._known: dict[tuple[Combination, float, int], list[Start]] = {}
+        self._last: tuple[Combination, Estimate, Fits] | None = None
 
     def about(self, combination: Combination, most: int) -> list[Start]:
         """Starts with one effect more than a fitted combination, each of at most so many places; none about one that
@@ -79,11 +83,16 @@ class Prospects:
         """A combination as it was fitted; None where it ran away."""
         w, white = self.weigher, self.weigher.found.of(combination, "white")
         assert white is not None
+        if self._last is not None and self._last[0] == combination and self._last[1] is white:
+            return self._last[2]
         weight = weights(w.problem, w.rows)
         predictions = w.stepper.predict(white.z[None], [combination], w.rows)
         noise = estimate_noise(w.problem, [combination], residuals(w.problem, predictions, weight), weight)
         fits = Fits([combination], white.z[None], noise, predictions, np.zeros(1), np.ones(1, bool))
-        return fits if np.isfinite(noise).all() else None
+        if not np.isfinite(noise).all():
+            return None
+        self._last = combination, white, fits
+        return fits
 
     def _units(self, most: int, sharp: Mapping[int, list[Unit]] | None = None) -> list[Unit]:
         """What is tried: every effect and target at its `sharp` places, or at all, thinned to so many at most."""
@@ -97,10 +106,8 @@ class Prospects:
         return out
 
 
-def promising(scanned: Sequence[Start], reach: float, share: float, most: int) -> list[Start]:
-    """Of what was looked at about one motion, at most so many that promise nearly as much as the best.
-
-    Nearly: within `reach` nats, or a `share`, since the farther off that motion is, the less exact are promises.
-    """
-    ranked = sorted(scanned, key=lambda start: -start.gain)[:most]
-    return [s for s in ranked if s.gain > ranked[0].gain - max(reach, share * ranked[0].gain)]
+def promising(scanned: Sequence[Start], reach: float) -> list[Start]:
+    """Of what was looked at about one motion, what promises nearly as much as the best: within `reach` nats, or a
+    share, since the farther off that motion is, the less exact are promises."""
+    ranked = sorted(scanned, key=lambda start: -start.gain)[:_FIRST]
+    return [s for s in ranked if s.gain > ranked[0].gain - max(reach, _VAGUE * ranked[0].gain)]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .._effects import NOISE, OUTLIERS, Candidate
+from .._effects import NOISE, OUTLIERS
 from ._calibrate import Priors
 from ._effect_priors import motion_along, with_effects, with_unnamed
 from ._found import Found
@@ -29,10 +29,6 @@ _REACH = 30.0
 _BASES, _PAIRS, _WORTH = 4, 32, 2.0
 # How many effects are fitted where they are small, and how often the same at other places or in other recordings.
 _SMALL, _ALIKE = 24, 4
-# Share of a promise that may be wrong.
-_VAGUE = 0.3
-# Effects that are fitted first, of the highest scores.
-_FIRST = 16
 # Combinations that a missing force is tried beside.
 _FORCED = 6
 # Combinations that are fitted between two looks at the clock.
@@ -267,17 +263,18 @@ class Search:
             if small := self._varied(scanned):
                 self.weigher.weigh(small, whole=True)
             return
-        along = promising(self.prospects.along(self._null, _FEW), _REACH, _VAGUE, _FIRST)
-        first = promising(scanned, _REACH, _VAGUE, _FIRST) + [s for s in along if self._new(s).effect.places]
+        along = promising(self.prospects.along(self._null, _FEW), _REACH)
+        plain = {self._with(c) for c in self.problem.searched if not self.problem.candidate(c).effect.places}
+        first = promising(scanned, _REACH) + [s for s in along if s.combination not in plain]
         if first:
             self.progress(f"weighing {len({s.combination for s in first})} likely effects")
-            self.weigher.weigh([s if self._new(s).effect.places else self._from_nothing(s.combination) for s in first])
+            self.weigher.weigh([self._from_nothing(s.combination) if s.combination in plain else s for s in first])
         if (best := self._adequate()) is not None:
             self._weigh_exchanged(best, 1, _SMALL)
             return
-        plain = [self._with(c) for c in self.problem.searched if not self.problem.candidate(c).effect.places
-                 and self.problem.candidate(c).effect is not OUTLIERS]  # fmt: skip
-        self._weigh_in_batches([self._from_nothing(c) for c in plain if c not in self.found.estimates])
+        taken_out = {self._with(c) for c in self.problem.searched if self.problem.candidate(c).effect is OUTLIERS}
+        left = plain - taken_out - set(self.found.estimates)
+        self._weigh_in_batches([self._from_nothing(c) for c in sorted(left)])
 
     def _varied(self, scanned: Sequence[Start]) -> list[Start]:
         """The best starts, not too many of one effect and target, whatever their places and recordings."""
@@ -326,11 +323,6 @@ class Search:
 
     def _with(self, member: int) -> Combination:
         return tuple(sorted((*self.base, member)))
-
-    def _new(self, start: Start) -> Candidate:
-        """The effect of a single one's start."""
-        (member,) = set(start.combination) - set(self.base)
-        return self.problem.candidate(member)
 
     def _gained(self, size: int) -> bool:
         """Whether the best of this size beats the best of smaller ones, so that a larger one may be worth it."""

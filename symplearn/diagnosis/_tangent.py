@@ -6,14 +6,14 @@ columns that are known already, and no trajectory is stepped for any place (the 
 only the best places are looked at there).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from .. import _effects as effects
-from ._calibrate import Fits, Priors, residuals, weights
+from ._calibrate import Fits, Priors, by_the_noise, noise_roots, weights
 from ._problem import Problem
 from ._scan import BEST, grid, layout, packed, spacing
 from ._score import Unit
@@ -25,7 +25,7 @@ _SUDDEN, _PERIODIC = (effects.IMPULSE, effects.REGIME), (effects.FORCING, effect
 _KEPT, _TIMES = 8, 400
 # Of the distance of a grid's neighbours, how far apart those are at least.
 _APART = 1.5
-# How far Phi Phi^-1 may be from one; beyond, the trajectory is too chaotic to be drawn back to its start.
+# Round-off of an inverse, relative; beyond, the trajectory is too chaotic to be drawn back to its start.
 _EXACT = 1e-6
 # Of what is left of a square after a projection.
 _ROUND_OFF = 1e-9
@@ -171,60 +171,56 @@ def _steady(problem: Problem, candidate: int) -> int:
 
 def _recordings(stepper: Stepper, fits: Fits, rows: Sequence[int], priors: Priors) -> list[_Recording] | None:
     """Every recording's part of a fit of one lane; None where it cannot be drawn back to the start."""
-    problem, (combination,), weight = stepper.problem, fits.combinations, weights(stepper.problem, rows)
-    steady = {_steady(problem, c) for c in problem.searched if problem.candidate(c).effect in _SUDDEN[1:] + _PERIODIC}
-    lanes = list(packed(problem, [Unit(c, None) for c in sorted(steady)]))
-    laid = [layout(problem, units) for units in lanes]
-    roots = [np.where(w > 0, np.sqrt(w), 0.0) / fits.noise[0] for w in weight]
-    error = np.concatenate([(x[0] * root).ravel() for x, root in
-                            zip(residuals(problem, fits.predictions, weight), roots, strict=True)])  # fmt: skip
-    left = _left(problem, fits, priors, roots, error)
+    problem = stepper.problem
+    left = _left(problem, fits, rows, priors)
     if left is None:
         return None
+    steady = {
+        _steady(problem, c) for c in problem.searched if problem.candidate(c).effect in (effects.REGIME, *_PERIODIC)
+    }
+    lanes = list(packed(problem, [Unit(c, None) for c in sorted(steady)]))
+    laid = [layout(problem, units) for units in ([], *lanes)]
     out = []
-    for r, (own, others) in enumerate(left):
-        carried = stepper.carried(fits.z[0], combination, laid, rows[r], r)
-        start, further = carried[0], carried[1:]
-        phi = start[:, :, problem.channels :].transpose(1, 2, 0)
-        if not np.isfinite(phi).all():
-            return None
-        back = np.linalg.pinv(phi)
-        if not np.abs(phi @ back - np.eye(problem.state)).max() < _EXACT:
+    for r, (error, others) in enumerate(left):
+        start, *further = stepper.carried(fits.z[0], fits.combinations[0], laid, rows[r], r)
+        back = _inverses(start[:, :, problem.channels :].transpose(1, 2, 0))
+        if back is None:
             return None
         pairs = [pair for units, lane in zip(lanes, further, strict=True) for pair in zip(units, lane, strict=True)]
         done = {unit.candidate: np.einsum("tds,ts->td", back, x[:, problem.channels :]) for unit, x in pairs}
-        slopes = start[:, :, : problem.channels].transpose(1, 2, 0) * roots[r][..., None]
-        out.append(_Recording(problem.rows[r].times[: rows[r]], slopes, back, done, own, others))
+        root = noise_roots(weights(problem, rows), fits)[r]
+        slopes = start[:, :, : problem.channels].transpose(1, 2, 0) * root[..., None]
+        out.append(_Recording(problem.rows[r].times[: rows[r]], slopes, back, done, error, others))
     return out
 
 
+def _inverses(phi: Float[np.ndarray, "row state state"]) -> np.ndarray | None:
+    """Their inverses; None where round-off would be more than `_EXACT` of them, whatever the units of the state."""
+    if not np.isfinite(phi).all():
+        return None
+    try:
+        back = np.linalg.inv(phi)
+    except np.linalg.LinAlgError:
+        return None
+    grown = np.einsum("tab,tba->ta", np.abs(back), np.abs(phi)).max()
+    return back if grown * np.finfo(float).eps < _EXACT else None
+
+
 def _left(
-    problem: Problem, fits: Fits, priors: Priors, roots: Sequence[np.ndarray], error: np.ndarray
+    problem: Problem, fits: Fits, rows: Sequence[int], priors: Priors
 ) -> list[tuple[np.ndarray, np.ndarray]] | None:
     """What the unknowns of a fit leave of the errors, and an orthonormal basis of what they can do, by recording."""
     (combination,), (z,) = fits.combinations, fits.z
     free = np.nonzero(problem.active(combination))[0]
     held = np.sqrt(priors.precision_of(problem, combination)[free])
-    columns = np.concatenate([*_slopes(problem, fits, roots, free), np.diag(held)])
-    whole = np.concatenate([error, held * (priors.mean_of(problem, combination) - z)[free]])
+    errors, slopes = by_the_noise(problem, fits, rows)
+    columns = np.concatenate([slopes[free].T, np.diag(held)])
+    whole = np.concatenate([errors, held * (priors.mean_of(problem, combination) - z)[free]])
     if not (np.isfinite(columns).all() and np.isfinite(whole).all()):
         return None
     basis = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
     whole = whole - basis @ (basis.T @ whole)
-    out, begin = [], 0
-    for root in roots:
-        part = slice(begin, begin + root.size)
-        out.append((whole[part].reshape(root.shape), basis[part].reshape(*root.shape, -1)))
-        begin += root.size
-    return out
-
-
-def _slopes(
-    problem: Problem, fits: Fits, roots: Sequence[np.ndarray], free: np.ndarray
-) -> Iterator[Float[np.ndarray, "reading free"]]:
-    """Slopes of every recording's readings in the free unknowns, by the noise."""
-    for r, root in enumerate(roots):
-        own = np.where(root > 0, fits.predictions[r].slopes[0], 0.0) * root
-        every = np.zeros((problem.size, root.size))
-        every[problem.local(r)] = own.reshape(len(own), -1)
-        yield every[free].T
+    ends = np.cumsum([0, *(n * problem.channels for n in rows)])
+    parts = [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    return [(whole[part].reshape(n, -1), basis[part].reshape(n, problem.channels, -1))
+            for n, part in zip(rows, parts, strict=True)]  # fmt: skip

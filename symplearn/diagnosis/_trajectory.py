@@ -228,12 +228,11 @@ class Stepper:
     def carried(
         self, z: Float[np.ndarray, " z"], combination: Combination, laid: Sequence[Any], rows: int, r: int
     ) -> list[Float[np.ndarray, "direction time _"]]:
-        """Slopes of one recording's readings and phase points: along its start, and along the amplitudes of each of
-        `laid`, as in `responses`."""
-        p = self.problem
-        nothing: Any = np.zeros_like(laid[0][0]), np.zeros_like(laid[0][1]), []
-        along = [np.arange(p.state), *(self._further + np.concatenate(amplitudes) for _, _, amplitudes in laid)]
-        some, hots = self._beside(z, combination, [nothing, *laid], r)
+        """Slopes of one recording's readings and phase points, by lane: along the amplitudes of each of `laid`, as in
+        `responses`, and along the start where there are none."""
+        some, hots = self._beside(z, combination, laid, r)
+        start = np.arange(self.problem.state)
+        along = [self._further + np.concatenate(amplitudes) if amplitudes else start for _, _, amplitudes in laid]
         found = []
         for a in range(0, len(along), LANES):
             _, slopes = self._run(r, some[a : a + LANES], hots[a : a + LANES], along[a : a + LANES], rows)
