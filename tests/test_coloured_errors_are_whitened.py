@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_triangular
 
-from symplearn.diagnosis._coloured import Colour, fit_colour, whitened_gram, whitened_series
+from symplearn.diagnosis._coloured import Colour, fit_colour, whitened_gram, whitened_residuals, whitened_series
 
 NUMBER = 40
 
@@ -77,6 +77,8 @@ def test_the_whitened_series_is_the_cholesky_factor_at_work():
     found = whitened_series(columns[0], weight, times, Colour(5.0, 3.0, 0.3, 0.0))
     np.testing.assert_allclose(found[seen], solve_triangular(L, columns[0][:, seen].T, lower=True), atol=1e-9)
     assert not found[~seen].any()
+    lanes = whitened_residuals(columns[0], weight, times, [Colour(5.0, 3.0, 0.3, 0.0)] * 3)
+    np.testing.assert_allclose(lanes, found.T, atol=1e-12)  # round-off
 
 
 def gain(residual, weight, times, colour):

@@ -186,12 +186,17 @@ def test_the_path_is_the_dense_smoothers(stepper, fits, lane, intensity, named):
         np.testing.assert_allclose(found[:, STATE], expected, atol=1e-5)
 
 
+def errors_of(problem, fits):
+    """Errors of the readings there are, by their noise, recordings end to end."""
+    weight = weights(problem, ROWS)
+    left = residuals(problem, fits.predictions, weight)
+    return np.concatenate([x[:, w > 0] for x, w in zip(left, weight, strict=True)], 1) / NOISE
+
+
 def gaussian(problem, fits, priors):
     """Log evidences of `weigh_white` without what it grants a sensor whose noise may have heavier tails, and effects
     of unknown strength."""
-    weight = weights(problem, ROWS)
-    left = residuals(problem, fits.predictions, weight)
-    e = np.concatenate([x[:, w > 0] for x, w in zip(left, weight, strict=True)], 1) / NOISE
+    e = errors_of(problem, fits)
     # Student's t of five degrees of freedom and variance one, beside the Gaussian, each half likely.
     gain = (t.logpdf(e, 5, scale=np.sqrt(3 / 5)) - norm.logpdf(e)).sum(1)
     return [
@@ -204,13 +209,16 @@ def gaussian(problem, fits, priors):
 
 
 def test_without_a_force_it_is_the_trajectory_fit(stepper, priors):
-    """As the intensity goes to zero, evidence, unknowns and covariance tend to those of the trajectory fit."""
+    """As the intensity goes to zero, evidence, unknowns, covariance and innovations tend to those of the trajectory
+    fit."""
     p = stepper.problem
     combinations = [(), effects(p)]
     begin = np.stack([start(p, 0.0, c).z for c in combinations])
     trajectories = calibrate(stepper, begin, combinations, priors, ROWS, tolerance=1e-10)
     white = weigh_white(p, trajectories, priors, ROWS)
     quiet = fit_paths(stepper, [start(p, 1e-14, c) for c in combinations], priors, ROWS)
+    for errors, found in zip(errors_of(p, trajectories), quiet, strict=True):
+        np.testing.assert_allclose(found.errors[~np.isnan(found.errors)], errors, atol=1e-5)
     for expected, value, found in zip(white, gaussian(p, trajectories, priors), quiet, strict=True):
         # What the force adds to the readings' variance is 1e-14 times some time cubed, over 2.5e-3.
         np.testing.assert_allclose(found.log_evidence, value, atol=1e-6)

@@ -40,7 +40,7 @@ def test_the_law_of_a_given_noise_is_a_mixture_of_two(problem, draw):
     e = draw(np.random.default_rng(0), 200)
     logs = [norm.logpdf(e).sum(), t.logpdf(e, 5, scale=np.sqrt(0.6)).sum()]
     expected = logsumexp(logs) - np.log(2) - logs[0]
-    found = law_gain(problem, (), alone(e, 0), np.array([GIVEN, 1.0]))
+    found = law_gain(problem, (), alone(e, 0))
     assert found == pytest.approx(expected, abs=1e-9)  # round-off of 200 logarithms
 
 
@@ -52,7 +52,7 @@ def test_the_law_of_an_estimated_noise_has_its_own_best_scale(problem, draw):
     best = minimize_scalar(lambda s: -t.logpdf(e, 5, scale=np.exp(s)).sum(), bounds=(-2, 1), method="bounded",
                            options={"xatol": 1e-8})  # fmt: skip
     gain = -best.fun - norm.logpdf(e).sum()
-    found = law_gain(problem, (), alone(e, 1), np.array([GIVEN, 1.0]))
+    found = law_gain(problem, (), alone(e, 1))
     # Thirty steps of its iteration leave less than 1e-6 of the scale.
     assert found == pytest.approx(np.logaddexp(0.0, gain) - np.log(2), abs=1e-6)
 
@@ -61,17 +61,16 @@ def test_columns_are_weighed_apart_and_no_reading_says_nothing(problem):
     """The gain of two columns is the sum of each one's; a column without readings has none."""
     rng = np.random.default_rng(2)
     both = rng.standard_t(3, size=(100, 2))
-    noise = np.array([GIVEN, 1.0])
-    apart = sum(law_gain(problem, (), alone(both[:, j], j), noise) for j in range(2))
-    assert law_gain(problem, (), both, noise) == pytest.approx(apart)
-    assert law_gain(problem, (), np.full((5, 2), np.nan), noise) == 0.0
+    apart = sum(law_gain(problem, (), alone(both[:, j], j)) for j in range(2))
+    assert law_gain(problem, (), both) == pytest.approx(apart)
+    assert law_gain(problem, (), np.full((5, 2), np.nan)) == 0.0
 
 
 def test_a_tail_that_is_heavy_is_worth_its_evidence_and_a_light_one_costs_a_bit(problem):
     """Gaussian readings lose at most log 2; readings of Student's t gain many nats."""
-    noise, rng = np.array([GIVEN, 1.0]), np.random.default_rng(3)
-    assert -np.log(2) <= law_gain(problem, (), alone(rng.normal(size=2000), 0), noise) < 0
-    assert law_gain(problem, (), alone(DRAWS["student"](rng, 2000), 0), noise) > 20
+    rng = np.random.default_rng(3)
+    assert -np.log(2) <= law_gain(problem, (), alone(rng.normal(size=2000), 0)) < 0
+    assert law_gain(problem, (), alone(DRAWS["student"](rng, 2000), 0)) > 20
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 3.0])

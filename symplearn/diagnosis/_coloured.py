@@ -97,6 +97,7 @@ def _series(columns, variances, gaps, ratio, frequency, damping):
     return _filter(columns, variances, gaps, ratio, frequency, damping, visit, jnp.zeros(()))[2]
 
 
+_lanes = jax.jit(jax.vmap(_series, (0, None, None, 0, 0, 0)))
 _on_grid = jax.jit(jax.vmap(jax.vmap(_squares, (None, None, None, 0, 0, 0)), (0, None, None, None, None, None)))
 _grams = jax.jit(jax.vmap(_gram, (0, None, None, 0, 0, 0)))
 
@@ -182,6 +183,20 @@ def whitened_gram(
     parts = [_grams(_filled(columns[c]), *rows, *(jnp.asarray(s[c]) for s in shape)) for c in _chunks(len(columns))]
     total, logs = (np.concatenate([np.asarray(part[i]) for part in parts])[: len(columns)] for i in range(2))
     return total, logs
+
+
+def whitened_residuals(
+    residuals: Float[np.ndarray, "lane time"],
+    weight: Float[np.ndarray, " time"],
+    times: Float[np.ndarray, " time"],
+    colours: list[Colour],
+) -> Float[np.ndarray, "lane time"]:
+    """Every lane's residuals whitened by its own colour, in units of its white sd."""
+    shape = [np.array([getattr(c, f) for c in colours]) for f in ("ratio", "frequency", "damping")]
+    rows = _variances(weight), _gaps(times)
+    parts = [_lanes(_filled(residuals[c][:, None]), *rows, *(jnp.asarray(s[c]) for s in shape))
+             for c in _chunks(len(residuals))]  # fmt: skip
+    return np.concatenate([np.asarray(part)[..., 0] for part in parts])[: len(residuals), : len(times)]
 
 
 def whitened_series(

@@ -32,6 +32,7 @@ class PathFit:
     paths: list[Float[np.ndarray, "_ state"]]
     laplace: Laplace | None = None
     converged: bool = False
+    errors: Float[np.ndarray, "row channel"] | None = None  # innovations by their own sd, NaN where nothing was read
     left_out: tuple[Bool[np.ndarray, "_ channel"], ...] | None = None  # readings that this fit does not use
 
     def used(self, r: int, weight: Float[np.ndarray, "time channel"]) -> Float[np.ndarray, "time channel"]:
@@ -105,7 +106,19 @@ def _iterate(stepper, fits: list[PathFit], priors: Priors, rows, weight, noisy: 
     if noisy:
         known = np.stack([problem.noise_of(fit.combination) for fit in fits])
         noise = _next_noise(known, noise, squares / np.maximum(numbers, 1))
-    return [replace(fit, z=z[b], noise=noise[b], paths=paths[b], laplace=steps[b]) for b, fit in enumerate(fits)]
+    errors = _innovations(problem, passes, moved)
+    return [replace(fit, z=z[b], noise=noise[b], paths=paths[b], laplace=steps[b], errors=errors[b])
+            for b, fit in enumerate(fits)]  # fmt: skip
+
+
+def _innovations(problem: Problem, passes, moved: np.ndarray) -> Float[np.ndarray, "lane row channel"]:
+    """Innovations of all recordings by their own sd where a step has moved the unknowns; NaN where nothing was read."""
+    parts = []
+    for r, (_, variances, done) in enumerate(passes):
+        columns = np.concatenate([np.ones((len(moved), 1)), moved[:, problem.local(r)]], axis=1)
+        e = np.einsum("btjc,bc->btj", np.asarray(done.innovations), columns)
+        parts.append(np.where(np.asarray(variances) > 0, e / np.sqrt(np.asarray(done.variances)), np.nan))
+    return np.concatenate(parts, axis=1)
 
 
 def _next_noise(known: np.ndarray, noise: np.ndarray, expected: np.ndarray) -> np.ndarray:

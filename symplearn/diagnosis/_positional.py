@@ -10,12 +10,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.polynomial.legendre import legvander
 
 from ._calibrate import Fits, Priors, residuals, weights
 from ._evidence import variance_inflation
 from ._problem import Problem
+from ._scatter import law_gain
 from ._weighed import REMAINDER, Estimate, correlated, trusting
 
 # Polynomials up to this degree, and variances of the error against the noise's that are tried.
@@ -29,8 +30,13 @@ class _Channel:
 
     columns: Float[np.ndarray, "column row"]
     plain: int  # columns that are no polynomials
-    number: int  # readings
+    seen: Bool[np.ndarray, " row"]
     log_weights: float
+
+    @property
+    def number(self) -> int:
+        """How many readings."""
+        return int(self.seen.sum())
 
     @cached_property
     def gram(self) -> Float[np.ndarray, "column column"]:
@@ -46,12 +52,12 @@ class _Channel:
         determinant = np.linalg.slogdet(held * ratio / (len(gram) - self.plain))[1]
         return gram[first, first] - taken, float(determinant) - self.log_weights
 
-    def cleared(self, ratio: float) -> Float[np.ndarray, "column row"]:
-        """The plain columns without what the polynomials take of them."""
+    def cleared(self, ratio: float) -> tuple[Float[np.ndarray, "column row"], Float[np.ndarray, " row"]]:
+        """The plain columns without what the polynomials take of them, and the share of each row's own that is left."""
         rest = self.columns[self.plain :]
         held = rest @ rest.T + np.eye(len(rest)) * len(rest) / ratio
-        plain = self.columns[: self.plain]
-        return plain - (plain @ rest.T) @ np.linalg.solve(held, rest)
+        plain, taking = self.columns[: self.plain], np.linalg.solve(held, rest)
+        return plain - (plain @ rest.T) @ taking, 1.0 - (rest * taking).sum(0)
 
 
 @np.errstate(all="ignore")  # a lane that diverged is told by its evidence
@@ -68,7 +74,7 @@ def weigh_positional(problem: Problem, fits: Fits, priors: Priors, rows: Sequenc
         grams, logs = np.stack([gram for gram, _ in both]), np.array([log for _, log in both])
         number = np.array([one.number for one in channels])
         one = correlated(problem, fits, b, grams, logs, number, sum(occam), priors)
-        out.append(_told(one, fits.z[b], channels, ratios, number))
+        out.append(_told(problem, one, fits.z[b], channels, ratios))
     return out
 
 
@@ -86,7 +92,7 @@ def _channel(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int) 
         parts.append(np.concatenate([x[b, None, :, j], slopes]))
     root = np.sqrt(np.concatenate([w[:, j] for w in weight]))
     columns = np.where(seen, np.concatenate([np.concatenate(parts, axis=1), shapes.T]), 0.0) * root
-    return _Channel(columns, 1 + problem.size, int(seen.sum()), float(2 * np.log(root[seen]).sum()))
+    return _Channel(columns, 1 + problem.size, seen, float(2 * np.log(root[seen]).sum()))
 
 
 def _ratio(problem: Problem, one: _Channel, j: int) -> tuple[float, float]:
@@ -107,12 +113,16 @@ def _ratio(problem: Problem, one: _Channel, j: int) -> tuple[float, float]:
 
 
 def _told(
-    one: Estimate, begin: np.ndarray, channels: Sequence[_Channel], ratios: Sequence[float], number: np.ndarray
+    problem: Problem, one: Estimate, begin: np.ndarray, channels: Sequence[_Channel], ratios: Sequence[float]
 ) -> Estimate:
-    """With the noise that the error adds to, and how far from white the scores are that it leaves."""
+    """With what heavier tails gain, the noise that the error adds to, and how far from white the scores are that it
+    leaves."""
     column = np.concatenate([[1.0], begin - one.z])
     errors = np.array([((column @ c.columns[: c.plain]) ** 2).sum() for c in channels])
-    total = np.sqrt(np.maximum(errors / np.maximum(number, 1), one.noise**2))
-    cleared = [c.cleared(ratio) for c, ratio in zip(channels, ratios, strict=True)]
-    scores = sum(x[1:] * (column @ x) / noise**2 for x, noise in zip(cleared, one.noise, strict=True))
-    return replace(one, kind="positional", noise=total, inflation=variance_inflation(scores.T))
+    number = np.array([max(c.number, 1) for c in channels])
+    total = np.sqrt(np.maximum(errors / number, one.noise**2))
+    cleared = [(*c.cleared(ratio), c.seen) for c, ratio in zip(channels, ratios, strict=True)]
+    scores = sum(x[1:] * (column @ x) / noise**2 for (x, *_), noise in zip(cleared, one.noise, strict=True))
+    left = [np.where(seen, column @ x / np.sqrt(share), np.nan) for x, share, seen in cleared]
+    value = one.log_evidence + law_gain(problem, one.combination, np.stack(left, axis=1) / one.noise)
+    return replace(one, kind="positional", noise=total, log_evidence=value, inflation=variance_inflation(scores.T))

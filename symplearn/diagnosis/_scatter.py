@@ -29,21 +29,26 @@ _ROUNDS = 50
 _CHANCE = 3.0
 
 
-def law_gain(
-    problem: Problem, combination: Combination, errors: Float[np.ndarray, "row channel"],
-    noise: Float[np.ndarray, " channel"],
-) -> float:  # fmt: skip
+def law_gain(problem: Problem, combination: Combination, errors: Float[np.ndarray, "row channel"]) -> float:
     """Log evidence gained by leaving open whether the noise is Gaussian or Student's, each half likely beforehand.
 
-    `errors` are standardised by `noise`, NaN where there is none. A heavy tail is the sensor's own, no mismatch.
+    `errors` are innovations by their own standard deviations, NaN where there is none: under a remainder, too, what is
+    predicted of a reading has the two moments it has, and either law's tails. A heavy tail is the sensor's own, no
+    mismatch.
     """
     known, total = problem.noise_of(combination), 0.0
     for j in range(errors.shape[1]):
         e = errors[~np.isnan(errors[:, j]), j]
-        if len(e):
-            gain = _student(e, bool(np.isnan(known[j]))) + 0.5 * float((e**2).sum()) + 0.5 * len(e) * np.log(2 * np.pi)
-            total += float(np.logaddexp(0.0, gain) - np.log(2.0))
+        if len(e) and np.isfinite(e).all():
+            free = bool(np.isnan(known[j]))
+            total += float(np.logaddexp(0.0, _student(e, free) - _gaussian(e, free)) - np.log(2.0))
     return total
+
+
+def _gaussian(e: np.ndarray, free: bool) -> float:
+    """Log likelihood of the Gaussian, its scale the best one where it is free, else one."""
+    scale = float(np.sqrt(np.mean(e**2))) if free else 1.0
+    return float(norm.logpdf(e, scale=max(scale, 1e-150)).sum())
 
 
 def _student(e: np.ndarray, free: bool) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ._calibrate import Fits, Priors, normal_equations, residuals, weights
-from ._coloured import Colour, fit_colour, whitened_gram, whitened_series
+from ._coloured import Colour, fit_colour, whitened_gram, whitened_residuals, whitened_series
 from ._evidence import Laplace, laplace, variance_inflation
 from ._problem import Combination, Problem
 from ._scatter import factor_evidence, law_gain
@@ -64,7 +64,7 @@ def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -
         one = _laplace(problem, combination, gram, offset[b], fits.z[b], priors)
         scores = _scores(problem, fits, b, r, weight)
         errors = standardised([x[b] for x in r], weight, fits.noise[b])
-        value = _earned(one, fits, b) + law_gain(problem, combination, errors, fits.noise[b])
+        value = _earned(one, fits, b) + law_gain(problem, combination, errors)
         value += factor_evidence(problem, combination, fits.noise[b], number)
         value += strength_gain(problem, combination, priors, fits.z[b] + one.step, one.covariance)
         out.append(
@@ -108,7 +108,23 @@ def weigh_coloured(problem: Problem, fits: Fits, priors: Priors, rows: list[int]
         mine = tuple(c[b] for c in chosen)
         one = correlated(problem, fits, b, grams[b], logs[b], number, sum(c.occam for c in mine), priors)
         out.append(replace(one, kind="coloured", colours=mine))
-    return out
+    return _with_laws(problem, fits, out, r, weight)
+
+
+def _with_laws(problem: Problem, fits: Fits, estimates: list[Estimate], r, weight) -> list[Estimate]:
+    """With what the innovations of coloured errors gain where noise may have heavier tails."""
+    lanes = trusting(problem, fits)
+    parts = []
+    for k, (x, w) in enumerate(zip(r, weight, strict=True)):
+        moved = np.stack([one.z - fits.z[b] for one, b in zip(estimates, lanes, strict=True)])[:, problem.local(k)]
+        left = x[lanes] - np.where(w > 0, np.einsum("bi,bitj->btj", moved, fits.predictions[k].slopes[lanes]), 0.0)
+        times = problem.rows[k].times[: len(w)]
+        series = [whitened_residuals(left[..., j], w[:, j], times, [one.colours[j] for one in estimates])
+                  for j in range(problem.channels)]  # fmt: skip
+        parts.append(np.where(w > 0, np.stack(series, axis=-1), np.nan))
+    errors = np.concatenate(parts, axis=1)
+    gains = [law_gain(problem, one.combination, e / one.noise) for one, e in zip(estimates, errors, strict=True)]
+    return [replace(one, log_evidence=one.log_evidence + gain) for one, gain in zip(estimates, gains, strict=True)]
 
 
 def trusting(problem: Problem, fits: Fits) -> list[int]:

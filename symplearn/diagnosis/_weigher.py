@@ -12,7 +12,7 @@ from ._found import Found
 from ._noisy import PathFit, fit_paths
 from ._positional import weigh_positional
 from ._problem import MOST, Combination, Problem
-from ._scatter import outlier_evidence, outliers, suspects
+from ._scatter import law_gain, outlier_evidence, outliers, suspects
 from ._score import Start
 from ._start import windows
 from ._strength import strength_gain
@@ -189,7 +189,7 @@ class Weigher:
         """Of the intensities tried for each combination, the best, owing for the choice."""
         for combination in dict.fromkeys(fit.combination for fit in fits):
             mine = [fit for fit in fits if fit.combination == combination]
-            values = np.array([fit.log_evidence + self._strength(fit) for fit in mine])
+            values = np.array([fit.log_evidence + self._granted(fit) for fit in mine])
             if not np.isfinite(values).any():
                 continue
             best = mine[int(np.argmax(values))]
@@ -211,11 +211,12 @@ class Weigher:
                 )  # fmt: skip
             )
 
-    def _strength(self, fit: PathFit) -> float:
-        """What a path gains where its effects may be of any order of magnitude."""
-        if fit.laplace is None:
+    def _granted(self, fit: PathFit) -> float:
+        """What a path gains where noise may have heavier tails, and its effects be of any order of magnitude."""
+        if fit.laplace is None or fit.errors is None:
             return 0.0
-        return strength_gain(self.problem, fit.combination, self.found.priors, fit.z, fit.laplace.covariance)
+        strength = strength_gain(self.problem, fit.combination, self.found.priors, fit.z, fit.laplace.covariance)
+        return strength + law_gain(self.problem, fit.combination, fit.errors)
 
     @property
     def is_long(self) -> bool:
