@@ -14,12 +14,12 @@ import itertools
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import logsumexp
+from scipy.special import log_ndtr, logsumexp
 from scipy.stats import norm
 
 from .._effects import EXCITATION, HIDDEN
 from ._calibrate import Priors
-from ._evidence import orthants
+from ._evidence import log_density, orthants
 from ._problem import Combination, Problem
 
 # Widths of the mixture, and the narrowest of them in standard deviations of the estimate.
@@ -118,10 +118,11 @@ def mixture_gain(
     told = vectors @ ((vectors.T @ centre) / left)
     shares = [_shares(spread[np.ix_(own == k, own == k)], alone) for k in range(own[-1] + 1)]
     widths = np.array(list(itertools.product(*shares)))[:, own]
-    widest = np.ones((1, len(own)))
-    each, moments = _log_weights(told, likelihood, widths, lowest, own)
-    whole, _ = _log_weights(told, likelihood, widest, lowest, own)
-    gain = float(logsumexp(each + (0.0 if alone else moments)) - np.log(len(widths)) - whole[0])
+    # The widest priors last, whose effects may be too weak to be seen.
+    logs, squares = _log_weights(told, likelihood, np.concatenate([widths, np.ones((1, len(own)))]), lowest)
+    if not alone:
+        logs[:-1] += sum(np.log(squares[:-1, own == k].mean(1)) for k in range(own[-1] + 1))
+    gain = float(logsumexp(logs[:-1]) - np.log(len(widths)) - logs[-1])
     return gain if np.isfinite(gain) else 0.0
 
 
@@ -144,12 +145,13 @@ def _widths(narrowest: float, alone: bool) -> np.ndarray:
 
 
 def _log_weights(
-    told: np.ndarray, likelihood: np.ndarray, widths: np.ndarray, lowest: np.ndarray, own: np.ndarray
+    told: np.ndarray, likelihood: np.ndarray, widths: np.ndarray, lowest: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Log evidence of every choice of widths, up to one constant, and what the squares of the strengths add to it."""
+    """Log evidence of every choice of widths, up to one constant, and by entry the posterior's mean square in the
+    prior's."""
     prior = widths**2
     total = likelihood + prior[:, :, None] * np.eye(len(told))
-    scale = np.sqrt(total[:, np.arange(len(told)), np.arange(len(told))])
+    scale = np.sqrt(np.diagonal(total, axis1=1, axis2=2))
     scales = scale[:, :, None] * scale[:, None, :]
     correlation = total / scales + _ROUND_OFF * np.eye(len(told))  # which two like unknowns may leave singular
     inverse = np.linalg.inv(correlation) / scales
@@ -159,18 +161,17 @@ def _log_weights(
     centre, covariance = prior * solved, prior[:, :, None] * (inverse @ likelihood)
     if some.any():
         out = out + orthants(centre[:, some] - lowest[some], covariance[:, some][:, :, some])
-        out = out - orthants(
-            np.broadcast_to(-lowest[some], (len(out), some.sum())), prior[:, some, None] * np.eye(some.sum())
-        )
+        out = out - log_ndtr(-lowest[some] / widths[:, some]).sum(1)
     variance = np.diagonal(covariance, axis1=1, axis2=2)
-    squares = _square(centre, variance, lowest) / _square(0.0 * centre, prior, lowest)
-    return out, sum(np.log(squares[:, own == k].mean(1)) for k in range(own[-1] + 1))
+    return out, _square(centre, variance, lowest) / _square(np.zeros_like(centre), prior, lowest)
 
 
 def _square(centre: np.ndarray, variance: np.ndarray, lowest: np.ndarray) -> np.ndarray:
     """Mean square of Gaussians that are cut off below a bound, each by itself."""
+    if not np.isfinite(lowest).any():
+        return np.maximum(centre**2 + variance, 1e-300)
     s = np.sqrt(np.maximum(variance, 1e-300))
     below = np.clip((lowest - centre) / s, -1e3, 1e3)  # far below is no bound
-    edge = np.exp(norm.logpdf(below) - norm.logcdf(-below))
+    edge = np.exp(log_density(below) - log_ndtr(-below))
     cut = np.where(np.isfinite(lowest), s * (lowest + centre) * edge, 0.0)
     return np.maximum(centre**2 + variance + cut, 1e-300)
