@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm, t
 
+from symplearn import _effects as effects
 from symplearn.diagnosis._calibrate import calibrate
 from symplearn.diagnosis._positional import _Channel, weigh_positional
 from symplearn.diagnosis._start import priors_without_effects
@@ -32,8 +33,8 @@ def test_polynomials_are_integrated_out(ratio):
     np.testing.assert_allclose(share, np.diag(np.linalg.inv(covariance)), rtol=1e-9)
 
 
-def evidences(scale, errors=None):
-    """Estimates of a spring, its stiffness calibrated, whose readings a sensor bends by `scale`, by remainder."""
+def fitted(scale, errors=None, given=False):
+    """A spring, its stiffness calibrated, whose reading a sensor bends by `scale`, fitted, its noise `given` or not."""
     rates = lambda t, x: [x[1], -x[0] - 0.01 * x[1]]  # noqa: E731
     q = cases.solved(rates, [1.0, 0.0], TIMES)[:, 0]
     errors = np.random.default_rng(2).normal(size=len(q)) if errors is None else errors
@@ -41,12 +42,20 @@ def evidences(scale, errors=None):
     more = (
         '[parameters]\nk = { value = 1.0, sd = 0.1 }\n[[terms]]\neffect = "viscous_damping"\ntarget = "q"\nc = 0.01\n'
     )
+    more += f"[recording.noise]\ny = {NOISE}\n" if given else ""
     p = cases.problem(cases.simulation("p**2/2 + k*q**2/2", more=more), [cases.recorded(TIMES, y)], 0.05)
     priors = replace(priors_without_effects(p), precision=np.full(p.size, 1e-2))
     begin = np.zeros(p.size)
     begin[[0, p.head]] = 1.0
-    fits = calibrate(Stepper(p), begin[None], [()], priors, [len(TIMES)])
-    assert fits.converged[0]
+    noises = [(m,) for m in p.searched if given and p.candidate(m).effect is effects.NOISE]
+    fits = calibrate(Stepper(p), np.stack([begin] * max(len(noises), 1)), noises or [()], priors, [len(TIMES)])
+    assert fits.converged.all()
+    return p, fits, priors
+
+
+def evidences(scale, errors=None):
+    """Estimates by remainder."""
+    p, fits, priors = fitted(scale, errors)
     kinds = (weigh_white, weigh_coloured, weigh_positional)
     return [weigh(p, fits, priors, [len(TIMES)])[0] for weigh in kinds]
 
@@ -82,3 +91,12 @@ def test_heavy_tails_speak_for_no_remainder():
         # Without the tails white noise would be that far ahead; fits of some unknowns change an error by a percent.
         assert one.log_evidence > straight[0].log_evidence - 0.5 * tails
     assert bent[2].log_evidence > bent[0].log_evidence + 20
+
+
+def test_a_noise_that_is_called_wrong_has_no_remainder_beside_it():
+    """Where every combination says that the noise is wrongly given, none is weighed under a coloured error or one that
+    goes with what is read, which would only blur it."""
+    p, fits, priors = fitted(0.0, given=True)
+    assert len(fits.z) == 1
+    assert weigh_coloured(p, fits, priors, [len(TIMES)]) == weigh_positional(p, fits, priors, [len(TIMES)]) == []
+    assert len(weigh_white(p, fits, priors, [len(TIMES)])) == 1

@@ -87,6 +87,8 @@ def weigh_coloured(problem: Problem, fits: Fits, priors: Priors, rows: list[int]
 
     None for a combination with a wrongly given noise, which a colour would only blur.
     """
+    if not trusting(problem, fits):
+        return []
     weight, lanes = weights(problem, rows), len(fits.z)
     r = residuals(problem, fits.predictions, weight)
     times = [rows_.times[:n] for rows_, n in zip(problem.rows, rows, strict=True)]
