@@ -19,7 +19,7 @@ def prepare(cache: bool) -> None:
     jax.config.update("jax_enable_compilation_cache", cache)  # $JAX_COMPILATION_CACHE_DIR may name one, too
     if folder is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
 
 
 def _passing_folder() -> str:

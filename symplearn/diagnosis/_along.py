@@ -5,7 +5,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -47,9 +46,10 @@ def along(
     """One of the functions above at phase points of a recording's leading rows."""
     rows, n = problem.rows[recording], len(states)
     given = (problem.parameter_values(recording, z), problem.coefficients(recording, z, combination))
-    moving = (states, rows.inputs[:n], rows.times[:n])
-    found = _mapped(problem.equations, what, *(jnp.asarray(a) for a in (*given, *moving)))
-    return np.asarray(found)
+    # The last row is repeated up to the longest recording's length, so that one program serves all.
+    every = np.minimum(np.arange(max(len(one.times) for one in problem.rows)), n - 1)
+    moving = (states[every], rows.inputs[every], rows.times[every])
+    return np.asarray(_mapped(problem.equations, what, *map(jax.device_put, (*given, *moving))))[:n]
 
 
 @eqx.filter_jit

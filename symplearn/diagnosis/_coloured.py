@@ -120,7 +120,7 @@ def _gaps(times: np.ndarray) -> Array:
 def _filled(values: np.ndarray) -> Array:
     """Rows filled up with zeros to a round number: missing ones without gaps, which change nothing."""
     lack = -values.shape[-1] % _ROUND
-    return jnp.asarray(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, lack)]))
+    return jax.device_put(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, lack)]))
 
 
 def _grid(times: list[np.ndarray]) -> np.ndarray:
@@ -144,7 +144,7 @@ def fit_colour(
     signal would explain everything and mean nothing.
     """
     grid = _grid(times)
-    ratio, frequency, damping = (jnp.asarray(grid[:, i]) for i in range(3))
+    ratio, frequency, damping = (jax.device_put(grid[:, i]) for i in range(3))
     square: Any = 0.0
     logs: Any = 0.0
     number = 0
@@ -180,7 +180,7 @@ def whitened_gram(
     """Gram matrix of the whitened columns in units of the white variance, and the sum of log innovation variances."""
     shape = [np.array([getattr(c, f) for c in colours]) for f in ("ratio", "frequency", "damping")]
     rows = _variances(weight), _gaps(times)
-    parts = [_grams(_filled(columns[c]), *rows, *(jnp.asarray(s[c]) for s in shape)) for c in _chunks(len(columns))]
+    parts = [_grams(_filled(columns[c]), *rows, *(jax.device_put(s[c]) for s in shape)) for c in _chunks(len(columns))]
     total, logs = (np.concatenate([np.asarray(part[i]) for part in parts])[: len(columns)] for i in range(2))
     return total, logs
 
@@ -194,7 +194,7 @@ def whitened_residuals(
     """Every lane's residuals whitened by its own colour, in units of its white sd."""
     shape = [np.array([getattr(c, f) for c in colours]) for f in ("ratio", "frequency", "damping")]
     rows = _variances(weight), _gaps(times)
-    parts = [_lanes(_filled(residuals[c][:, None]), *rows, *(jnp.asarray(s[c]) for s in shape))
+    parts = [_lanes(_filled(residuals[c][:, None]), *rows, *(jax.device_put(s[c]) for s in shape))
              for c in _chunks(len(residuals))]  # fmt: skip
     return np.concatenate([np.asarray(part)[..., 0] for part in parts])[: len(residuals), : len(times)]
 
@@ -206,5 +206,5 @@ def whitened_series(
     colour: Colour,
 ) -> Float[np.ndarray, "time column"]:
     """The whitened columns of one lane, row by row, in units of the white sd."""
-    shape = (jnp.asarray(x) for x in (colour.ratio, colour.frequency, colour.damping))
+    shape = (jax.device_put(x) for x in (colour.ratio, colour.frequency, colour.damping))
     return np.asarray(_series(_filled(columns), _variances(weight), _gaps(times), *shape))[: len(times)]

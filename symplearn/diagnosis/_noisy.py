@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -95,7 +95,7 @@ def _iterate(stepper, fits: list[PathFit], priors: Priors, rows, weight, noisy: 
     squares, numbers = 0.0, 0.0
     for r, (linear, variances, done) in enumerate(passes):
         local = problem.local(r)
-        back = backward_lanes(linear, done, variances, jnp.asarray(moved[:, local]))
+        back = backward_lanes(linear, done, variances, jax.device_put(moved[:, local]))
         shift = np.asarray(back.shift)[:, : rows[r]]
         used = np.stack([fit.used(r, weight[r]) for fit in fits])
         squares = squares + (used * np.asarray(back.noise)[:, : rows[r]]).sum(1)
@@ -145,18 +145,18 @@ def _pass(stepper, fits: list[PathFit], r: int, rows: int, weight: np.ndarray, s
         variances.append(
             padded(fit.noise**2 * np.where(used > 0, 1.0 / np.where(used > 0, used, 1.0), 0.0), length, 0.0)
         )
-    given = jnp.asarray(np.stack(variances))
+    given = jax.device_put(np.stack(variances))
     linear, done = forward_lanes(
         problem.equations,
         problem.integrator,
         stepper.courses[r],
-        jnp.asarray(np.stack([_prolonged(fit.paths[r], length) for fit in fits])),
-        jnp.asarray(z[:, problem.head : problem.slots]),
-        jnp.asarray(slots),
-        jnp.asarray(hots),
-        jnp.asarray(padded(problem.rows[r].readings[:rows], length, np.nan)),
+        jax.device_put(np.stack([_prolonged(fit.paths[r], length) for fit in fits])),
+        jax.device_put(z[:, problem.head : problem.slots]),
+        jax.device_put(slots),
+        jax.device_put(hots),
+        jax.device_put(padded(problem.rows[r].readings[:rows], length, np.nan)),
         given,
-        jnp.asarray(np.stack([fit.intensity for fit in fits])),
+        jax.device_put(np.stack([fit.intensity for fit in fits])),
         switches_of(problem, r, hots),
     )
     return linear, given, done

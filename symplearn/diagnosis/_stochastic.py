@@ -101,8 +101,8 @@ def softness(problem: Problem, course: Course, z: np.ndarray, recording: int) ->
     """d2H/dp_i2 at the initial phase point, by which a missing impulse becomes a missing velocity."""
     eq = problem.equations
     x = z[recording * problem.state : (recording + 1) * problem.state].reshape(2, -1)[:, : eq.dim].ravel()
-    rest = [problem.parameter_values(recording, z), course.inputs[0], course.times[:1], np.zeros(eq.size)]
-    return np.asarray(eq.softness(jnp.concatenate([jnp.asarray(part, float) for part in (x, *rest)])))
+    rest = [problem.parameter_values(recording, z), np.asarray(course.inputs)[0], np.asarray(course.times)[:1]]
+    return np.asarray(eq.softness(jax.device_put(np.concatenate([x, *rest, np.zeros(eq.size)]))))
 
 
 def run_filter(
@@ -129,15 +129,15 @@ def run_filter(
         problem.equations,
         problem.integrator,
         course,
-        jnp.asarray(z[head : head + f]),
-        jnp.asarray(found),
-        jnp.asarray(noise),
-        jnp.asarray(intensity),
-        jnp.asarray(softness(problem, course, z, recording)),
-        jnp.asarray(z[recording * problem.state : (recording + 1) * problem.state]),
-        jnp.asarray(spread),
-        jnp.asarray(readings),
-        jnp.asarray(row_roots(problem, recording, length, ratio)),
+        jax.device_put(z[head : head + f]),
+        jax.device_put(found),
+        jax.device_put(noise),
+        jax.device_put(intensity),
+        jax.device_put(softness(problem, course, z, recording)),
+        jax.device_put(z[recording * problem.state : (recording + 1) * problem.state]),
+        jax.device_put(spread),
+        jax.device_put(readings),
+        jax.device_put(row_roots(problem, recording, length, ratio)),
     )
     return (model, spans, contexts), filtered
 
@@ -158,9 +158,9 @@ def free_run(
         problem.equations,
         problem.integrator,
         course,
-        jnp.asarray(z[head : head + f]),
-        jnp.asarray(coefficients),
-        jnp.asarray(x),
+        jax.device_put(z[head : head + f]),
+        jax.device_put(coefficients),
+        jax.device_put(x),
         jnp.asarray(start),
     )
     rows = slice(start, len(problem.rows[recording].times))

@@ -54,15 +54,15 @@ def _course(problem: Problem, r: int, length: int) -> Course:
     known[c.place[: c.parameters]] = 0.0
     lack = length - len(rows.times)
 
-    def padded(leaf: Array, more: int) -> Array:
-        return jnp.pad(jnp.asarray(leaf), [(0, more)] + [(0, 0)] * (jnp.ndim(leaf) - 1))
+    def padded(leaf: Any, more: int) -> Array:
+        return jax.device_put(np.pad(np.asarray(leaf), [(0, more)] + [(0, 0)] * (np.ndim(leaf) - 1)))
 
     return Course(
         # One span more than there are gaps: the last leads nowhere, and padding has steps of length zero.
         jax.tree.map(partial(padded, more=lack + 1), rows.spans),
-        padded(jnp.asarray(rows.times), lack),
-        padded(jnp.asarray(rows.inputs), lack),
-        *(jnp.asarray(a) for a in (known, problem.terms[r], to_parameters, to_coefficients)),
+        padded(rows.times, lack),
+        padded(rows.inputs, lack),
+        *map(jax.device_put, (known, problem.terms[r], to_parameters, to_coefficients)),
     )
 
 
@@ -192,7 +192,7 @@ class Stepper:
         directions = np.zeros((number, width, local_z.shape[1]))
         for lane, places in enumerate(along):
             directions[lane, np.arange(len(places)), places] = 1.0
-        some, matrices, along_some = (jnp.asarray(a[lanes]) for a in (local_z, hots, directions))
+        some, matrices, along_some = (jax.device_put(a[lanes]) for a in (local_z, hots, directions))
         last, switches = jnp.asarray(rows), switches_of(p, r, hots)
         parts = [
             _sensitivities(
