@@ -52,12 +52,12 @@ class _Channel:
         determinant = np.linalg.slogdet(held * ratio / (len(gram) - self.plain))[1]
         return gram[first, first] - taken, float(determinant) - self.log_weights
 
-    def cleared(self, ratio: float) -> tuple[Float[np.ndarray, "column row"], Float[np.ndarray, " row"]]:
-        """The plain columns without what the polynomials take of them, and the share of each row's own that is left."""
+    def cleared(self, ratio: float) -> Float[np.ndarray, "column row"]:
+        """The plain columns without what the polynomials take of them."""
         rest = self.columns[self.plain :]
         held = rest @ rest.T + np.eye(len(rest)) * len(rest) / ratio
-        plain, taking = self.columns[: self.plain], np.linalg.solve(held, rest)
-        return plain - (plain @ rest.T) @ taking, 1.0 - (rest * taking).sum(0)
+        plain = self.columns[: self.plain]
+        return plain - (plain @ rest.T) @ np.linalg.solve(held, rest)
 
 
 @np.errstate(all="ignore")  # a lane that diverged is told by its evidence
@@ -121,8 +121,14 @@ def _told(
     errors = np.array([((column @ c.columns[: c.plain]) ** 2).sum() for c in channels])
     number = np.array([max(c.number, 1) for c in channels])
     total = np.sqrt(np.maximum(errors / number, one.noise**2))
-    cleared = [(*c.cleared(ratio), c.seen) for c, ratio in zip(channels, ratios, strict=True)]
-    scores = sum(x[1:] * (column @ x) / noise**2 for (x, *_), noise in zip(cleared, one.noise, strict=True))
-    left = [np.where(seen, column @ x / np.sqrt(share), np.nan) for x, share, seen in cleared]
+    cleared = [c.cleared(ratio) for c, ratio in zip(channels, ratios, strict=True)]
+    scores = sum(x[1:] * (column @ x) / noise**2 for x, noise in zip(cleared, one.noise, strict=True))
+    left = [_left(c, column @ x, column, ratio) for c, x, ratio in zip(channels, cleared, ratios, strict=True)]
     value = one.log_evidence + law_gain(problem, one.combination, np.stack(left, axis=1) / one.noise)
     return replace(one, kind="positional", noise=total, log_evidence=value, inflation=variance_inflation(scores.T))
+
+
+def _left(one: _Channel, errors: np.ndarray, column: np.ndarray, ratio: float) -> Float[np.ndarray, " row"]:
+    """Errors that the polynomials leave, NaN where nothing was read; of the size that the evidence takes them for."""
+    square = float(column @ one.marginal(ratio)[0] @ column)
+    return np.where(one.seen, errors * np.sqrt(max(square, 0.0) / max(float((errors**2).sum()), 1e-300)), np.nan)

@@ -14,6 +14,8 @@ from ._problem import Combination, Problem
 
 # Degrees of freedom of the heavy-tailed noise that is weighed beside the Gaussian.
 _FREEDOM = 5.0
+# Beyond this mean square of standardised errors a fit has gone astray: its likelihood is next to nothing by any law.
+_ASTRAY = 1e6
 # Prior of a wrongly given noise: standard deviation of the logarithm of its factor.
 _FACTOR = 1.0
 # Priors of outliers: their share is below this one, and the logarithm of their size has this standard deviation.
@@ -39,7 +41,7 @@ def law_gain(problem: Problem, combination: Combination, errors: Float[np.ndarra
     known, total = problem.noise_of(combination), 0.0
     for j in range(errors.shape[1]):
         e = errors[~np.isnan(errors[:, j]), j]
-        if len(e) and np.isfinite(e).all():
+        if len(e) and np.mean(e**2) < _ASTRAY:
             free = bool(np.isnan(known[j]))
             total += float(np.logaddexp(0.0, _student(e, free) - _gaussian(e, free)) - np.log(2.0))
     return total
