@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from .._augmented_flow import Span
 from .._errors import InputError
+from .._importance import softened
 from .._recording import Recording
 from .._rows import spans_between
 from .._triangular import semidefinite_cholesky
@@ -18,10 +19,13 @@ from ._outlook import colour_ratio, intensity_of, start_spread, total_noise
 from ._problem import Problem
 from ._record import Forecast
 from ._stochastic import filter_lane, padded, row_roots, softness
+from ._taught import root_of, taught
 from ._trajectory import Stepper, effect_coefficients, model_at
 from ._weighed import Estimate
 
 _DRAWS = 128
+# Draws that count at least: where fewer would, the Gaussian is no good guess, and they are weighed less strictly.
+_LEAST = 16.0
 _LONGEST = 1_000_000
 
 
@@ -53,34 +57,59 @@ def forecast(
     """Mean and sd of the expected readings of the first recording, without reading noise."""
     columns: dict[str, dict[str, np.ndarray]] = {name: {} for name in stepper.problem.equations.columns}
     for label, estimate in (("before", before), ("after", after)):
-        drawn = _draws(stepper, recording, estimate, times, inflation, jax.random.key(seed))
+        mean, sd = _expected(stepper, recording, estimate, times, inflation, jax.random.key(seed))
         for j, name in enumerate(columns):
-            columns[name][label] = drawn[..., j].mean(0)
-            columns[name][f"{label}_sd"] = drawn[..., j].std(0)
+            columns[name][label], columns[name][f"{label}_sd"] = mean[..., j], sd[..., j]
     return Forecast(times, columns)
 
 
-def _draws(
+def _expected(
     stepper: Stepper, recording: Recording, e: Estimate, times: np.ndarray, inflation: float, key: Array
-) -> np.ndarray:
-    """Readings (draw, time, channel) of posterior draws, run on from the state filtered through all rows."""
+) -> tuple[Float[np.ndarray, "time channel"], Float[np.ndarray, "time channel"]]:
+    """Expected readings and their sd: run on from the phase point at the last of all rows, by draws of the posterior.
+
+    Where no force is missing they are those of the most probable trajectory, since a Gaussian's draws of a time or of a
+    frequency leave it farther than the readings would let them; for the same reason the draws are weighed there.
+    """
     problem, course, rows = stepper.problem, stepper.courses[0], stepper.problem.rows[0]
-    local = problem.local(0)
-    root = np.asarray(semidefinite_cholesky(jnp.asarray(e.covariance[np.ix_(local, local)] * inflation)))
-    state_key, unit_key = jax.random.split(key)
-    units = np.asarray(jax.random.normal(unit_key, (_DRAWS // 2, len(local))))
-    zs = e.z[local] + np.concatenate([units, -units]) @ root.T
+    unit_key, state_key, push_key = jax.random.split(key, 3)
+    root = root_of(problem, e, inflation)
+    units = np.asarray(jax.random.normal(unit_key, (_DRAWS // 2, len(root))))
+    units = np.concatenate([0 * units[:1], units, -units])
+    zs, onehot = _within(problem, e.z[problem.local(0)] + units @ root.T), jnp.asarray(problem.onehot(e.combination, 0))
+    model, weights = (problem.equations, problem.integrator, course), np.zeros(len(units))
+    if e.intensity is None:
+        all_rows = taught(stepper, e, root)
+        zs_of_all = _within(problem, all_rows.mean + units @ all_rows.root.T)
+        seen, states = _run_through(*model, jnp.asarray(zs_of_all), onehot)
+        ends = states[:, len(rows.times) - 1]
+        weights = all_rows.log_weights(units, np.asarray(seen)[:, : len(rows.times)], rows.readings)
+    else:
+        length = course.times.shape[0]
+        fixed = (jnp.asarray(total_noise(e)), jnp.asarray(e.intensity), jnp.asarray(softness(problem, course, e.z, 0)),
+                 jnp.asarray(start_spread(stepper, e, 0)), jnp.asarray(padded(rows.readings, length, np.nan)),
+                 jnp.asarray(row_roots(problem, 0, length, colour_ratio(e))), onehot)  # fmt: skip
+        ends = _filter_through(*model, jnp.asarray(zs), fixed, jax.random.split(state_key, len(zs)))
     path = np.concatenate([rows.times[-1:], times])
     pieces = max(1, math.ceil(np.max(np.diff(path)) / float(np.max(rows.spans.step)) - 1e-9))
     inputs = np.zeros((len(times), 0)) if recording.inputs is None else recording.inputs.at(times)
     ahead = (spans_between(path, pieces, recording.inputs), jnp.asarray(times), jnp.asarray(inputs))
-    onehot, noise, length = problem.onehot(e.combination, 0), total_noise(e), course.times.shape[0]
-    fixed = (jnp.asarray(noise), jnp.asarray(intensity_of(stepper, e)), jnp.asarray(softness(problem, course, e.z, 0)),
-             jnp.asarray(start_spread(stepper, e, 0)), jnp.asarray(padded(rows.readings, length, np.nan)),
-             jnp.asarray(row_roots(problem, 0, length, colour_ratio(e))), jnp.asarray(onehot))  # fmt: skip
-    drawn = _run_draws(problem.equations, problem.integrator, course, jnp.asarray(_within(problem, zs)), fixed, ahead,
-                       jax.random.split(state_key, _DRAWS))  # fmt: skip
-    return _finite(np.asarray(drawn))
+    intensity = jnp.asarray(intensity_of(stepper, e))
+    drawn = _run_on(*model, jnp.asarray(zs), ends, onehot, intensity, ahead, jax.random.split(push_key, len(zs)))
+    return _summary(np.asarray(drawn), weights, about_first=e.intensity is None)
+
+
+def _summary(
+    drawn: Float[np.ndarray, "draw time channel"], log_weights: np.ndarray, about_first: bool
+) -> tuple[Float[np.ndarray, "time channel"], Float[np.ndarray, "time channel"]]:
+    """Mean and sd of draws that stayed finite, or the first and the deviations from it; `InputError` where hardly any
+    did."""
+    good = np.isfinite(drawn).all((1, 2)) & np.isfinite(log_weights)
+    if good.sum() < _DRAWS // 4 or (about_first and not good[0]):
+        raise InputError("--forecast-until: the trajectory diverges before that time; give an earlier one")
+    weights = softened(log_weights[good], least=min(_LEAST, float(good.sum())))
+    centre = drawn[0] if about_first else np.einsum("d,dtc->tc", weights, drawn[good])
+    return centre, np.sqrt(np.einsum("d,dtc->tc", weights, (drawn[good] - centre) ** 2))
 
 
 def _within(problem: Problem, zs: np.ndarray) -> np.ndarray:
@@ -90,31 +119,55 @@ def _within(problem: Problem, zs: np.ndarray) -> np.ndarray:
     return zs
 
 
-def _finite(drawn: np.ndarray) -> np.ndarray:
-    """Draws that stayed finite; `InputError` where hardly any did."""
-    good = np.isfinite(drawn).all((1, 2))
-    if good.sum() < _DRAWS // 4:
-        raise InputError("--forecast-until: the trajectory diverges before that time; give an earlier one")
-    return drawn[good]
+@eqx.filter_jit
+def _run_through(equations: Any, integrator: Any, course: Any, zs: Array, onehot: Array) -> tuple[Array, Array]:
+    """Readings (draw, time, channel) and phase points of trajectories that no force disturbs."""
+    state, f = 2 * equations.width, course.to_parameters.shape[0]
+
+    def one(z: Array) -> tuple[Array, Array]:
+        coefficients = effect_coefficients(z[state + f :], onehot)
+        flow, read = model_at(equations, integrator, course, z[state : state + f], coefficients)
+
+        def step(x: Array, row: tuple[Span, Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+            span, t, u = row
+            return flow(x, span), (read(x, (t, u)), x)
+
+        return jax.lax.scan(step, z[:state], (course.spans, course.times, course.inputs))[1]
+
+    return jax.lax.map(one, zs, batch_size=16)
 
 
 @eqx.filter_jit
-def _run_draws(equations: Any, integrator: Any, course: Any, zs: Array, fixed: Any, ahead: Any, keys: Array) -> Array:
+def _filter_through(equations: Any, integrator: Any, course: Any, zs: Array, fixed: Any, keys: Array) -> Array:
+    """A draw of the phase point at the last row for every draw of the parameters, filtered through all rows."""
     noise, intensity, soft, spread, readings, roots, onehot = fixed
-    spans, times, inputs = ahead
     state, f = 2 * equations.width, course.to_parameters.shape[0]
 
     def one(z: Array, key: Array) -> Array:
         calibrated, coefficients = z[state : state + f], effect_coefficients(z[state + f :], onehot)
-        model, _, _, filtered = filter_lane(
+        _, _, _, filtered = filter_lane(
             equations, integrator, course, calibrated, coefficients, noise, intensity, soft, z[:state], spread,
             readings, roots,
         )  # fmt: skip
-        first, later = jax.random.split(key)
         root = semidefinite_cholesky(filtered.filtered_covariances[-1])
-        x = filtered.filtered_means[-1] + root @ jax.random.normal(first, (state,))
-        flow, read = model_at(equations, integrator, course, calibrated, coefficients)
-        pushes = jax.random.normal(later, (times.shape[0], equations.dim))
+        return filtered.filtered_means[-1] + root @ jax.random.normal(key, (state,))
+
+    return jax.lax.map(lambda pair: one(*pair), (zs, keys), batch_size=16)
+
+
+@eqx.filter_jit
+def _run_on(
+    equations: Any, integrator: Any, course: Any, zs: Array, ends: Array, onehot: Array, intensity: Array, ahead: Any,
+    keys: Array,
+) -> Array:  # fmt: skip
+    """Readings (draw, time, channel) from given phase points on, under a white missing force."""
+    spans, times, inputs = ahead
+    state, f = 2 * equations.width, course.to_parameters.shape[0]
+
+    def one(z: Array, x: Array, key: Array) -> Array:
+        coefficients = effect_coefficients(z[state + f :], onehot)
+        flow, read = model_at(equations, integrator, course, z[state : state + f], coefficients)
+        pushes = jax.random.normal(key, (times.shape[0], equations.dim))
 
         def step(x: Array, row: tuple[Span, Array, Array, Array]) -> tuple[Array, Array]:
             span, t, u, push = row
@@ -123,4 +176,4 @@ def _run_draws(equations: Any, integrator: Any, course: Any, zs: Array, fixed: A
 
         return jax.lax.scan(step, x, (spans, times, inputs, pushes))[1]
 
-    return jax.lax.map(lambda pair: one(*pair), (zs, keys), batch_size=16)
+    return jax.lax.map(lambda three: one(*three), (zs, ends, keys), batch_size=16)

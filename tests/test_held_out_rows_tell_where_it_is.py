@@ -1,0 +1,86 @@
+"""A forecast begins where all rows put the phase point, although its parameters are those of the fitted rows."""
+
+from dataclasses import replace
+
+import engine_cases as cases
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from symplearn.diagnosis._calibrate import calibrate
+from symplearn.diagnosis._start import priors_without_effects
+from symplearn.diagnosis._taught import root_of, taught
+from symplearn.diagnosis._trajectory import Stepper
+from symplearn.diagnosis._weighed import weigh_white
+
+NOISE, TIMES = 0.05, np.linspace(0.0, 40.0, 200)
+
+
+def spring(outlier=0.0):
+    """A spring that is fitted to three quarters of its rows, its stiffness free: stepper, estimate, readings."""
+    q = cases.solved(lambda t, x: [x[1], -1.1 * x[0]], [1.0, 0.3], TIMES)[:, 0]
+    y = q + NOISE * np.random.default_rng(0).normal(size=len(q))
+    y[180] += outlier
+    more = f"[parameters]\nk = {{ value = 1.1 }}\n[recording.noise]\ny = {NOISE}\n"
+    file = cases.simulation("p**2/2 + k*q**2/2", more=more)
+    p = cases.problem(file, [cases.recorded(TIMES, y)], 0.02, holdout=0.25)
+    stepper, rows = Stepper(p), [r.fitted for r in p.rows]
+    priors = replace(priors_without_effects(p), precision=np.full(p.size, 1e-9))
+    begin = np.zeros((1, p.size))
+    begin[0, [0, p.state // 2, p.head]] = 1.0, 0.3, 1.1
+    fits = calibrate(stepper, begin, [()], priors, rows)
+    return stepper, weigh_white(p, fits, priors, rows)[0], y
+
+
+def closed_form(y):
+    """Start and stiffness by SciPy's least squares on the closed form, from all rows, and their covariance."""
+
+    def errors(x):
+        w = np.sqrt(x[2])
+        return (x[0] * np.cos(w * TIMES) + x[1] / w * np.sin(w * TIMES) - y) / NOISE
+
+    found = least_squares(errors, [1.0, 0.3, 1.1], x_scale="jac", xtol=1e-12)
+    return found.x, np.linalg.inv(found.jac.T @ found.jac)
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    stepper, estimate, y = spring()
+    p = stepper.problem
+    where = [0, p.state // 2, p.state]
+    found = taught(stepper, estimate, root_of(p, estimate, 1.0))
+    return stepper, estimate, found, where, *closed_form(y)
+
+
+def test_fit_and_held_out_rows_together_are_the_fit_of_all_rows(learnt):
+    """Mean and covariance are those of SciPy's least squares on all rows at once; the fit alone is far from them."""
+    stepper, estimate, found, where, expected, covariance = learnt
+    sd = np.sqrt(np.diag(covariance))
+    # Tails of Student's t take a tenth of the weight of the held-out readings, which are a quarter of all.
+    assert np.all(np.abs(found.mean[where] - expected) < 0.3 * sd)
+    spread = (found.root @ found.root.T)[np.ix_(where, where)]
+    np.testing.assert_allclose(np.sqrt(np.diag(spread)), sd, rtol=0.1)
+    before = np.sqrt(np.diag(estimate.covariance))[[0, stepper.problem.state // 2, stepper.problem.head]]
+    assert (before > 1.2 * sd).any()
+
+
+def test_an_outlier_among_them_moves_little():
+    """A reading that lies twenty sd off moves no unknown by half of an sd."""
+    ends = []
+    for outlier in (0.0, 20 * NOISE):
+        stepper, estimate, _ = spring(outlier)
+        ends.append(taught(stepper, estimate, root_of(stepper.problem, estimate, 1.0)))
+    sd = np.sqrt(np.maximum(np.diag(ends[0].root @ ends[0].root.T), 1e-300))
+    assert np.all(np.abs(ends[1].mean - ends[0].mean) < 0.5 * sd + 1e-12)
+
+
+def test_draws_of_a_gaussian_posterior_are_weighed_alike(learnt):
+    """Where readings depend on the unknowns linearly, draws differ from their Gaussian by nothing."""
+    stepper, _, found, *_ = learnt
+    units = 0.1 * np.random.default_rng(1).normal(size=(6, len(found.mean)))
+    linear = found.errors.left + np.einsum("dl,ltc->dtc", units @ found.root.T, found.errors.slopes)
+    scale, readings = found.errors.scale, stepper.problem.rows[0].readings
+    shown = readings - linear / scale
+    np.testing.assert_allclose(found.log_weights(units, shown, readings), 0.0, atol=1e-9)  # round-off of 200 squares
+    far = found.log_weights(units, shown + 3 * NOISE, readings)
+    assert (far < -100).all()
