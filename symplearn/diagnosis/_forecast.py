@@ -71,32 +71,55 @@ def _expected(
     Where no force is missing they are those of the most probable trajectory, since a Gaussian's draws of a time or of a
     frequency leave it farther than the readings would let them; for the same reason the draws are weighed there.
     """
-    problem, course, rows = stepper.problem, stepper.courses[0], stepper.problem.rows[0]
     unit_key, state_key, push_key = jax.random.split(key, 3)
-    root = root_of(problem, e, inflation)
+    root = root_of(stepper.problem, e, inflation)
     units = np.asarray(jax.random.normal(unit_key, (_DRAWS // 2, len(root))))
     units = np.concatenate([0 * units[:1], units, -units])
-    zs, onehot = _within(problem, e.z[problem.local(0)] + units @ root.T), jnp.asarray(problem.onehot(e.combination, 0))
-    model, weights = (problem.equations, problem.integrator, course), np.zeros(len(units))
+    zs = jnp.asarray(_within(stepper.problem, e.z[stepper.problem.local(0)] + units @ root.T))
     if e.intensity is None:
-        all_rows = taught(stepper, e, root)
-        zs_of_all = _within(problem, all_rows.mean + units @ all_rows.root.T)
-        seen, states = _run_through(*model, jnp.asarray(zs_of_all), onehot)
-        ends = states[:, len(rows.times) - 1]
-        weights = all_rows.log_weights(units, np.asarray(seen)[:, : len(rows.times)], rows.readings)
+        ends, log_weights = _by_all_rows(stepper, e, root, units)
     else:
-        length = course.times.shape[0]
-        fixed = (jnp.asarray(total_noise(e)), jnp.asarray(e.intensity), jnp.asarray(softness(problem, course, e.z, 0)),
-                 jnp.asarray(start_spread(stepper, e, 0)), jnp.asarray(padded(rows.readings, length, np.nan)),
-                 jnp.asarray(row_roots(problem, 0, length, colour_ratio(e))), onehot)  # fmt: skip
-        ends = _filter_through(*model, jnp.asarray(zs), fixed, jax.random.split(state_key, len(zs)))
-    path = np.concatenate([rows.times[-1:], times])
-    pieces = max(1, math.ceil(np.max(np.diff(path)) / float(np.max(rows.spans.step)) - 1e-9))
+        ends, log_weights = _filtered(stepper, e, zs, state_key), np.zeros(len(units))
+    ahead = _ahead(stepper.problem, recording, times)
+    drawn = _run_on(*_model(stepper), zs, ends, jnp.asarray(stepper.problem.onehot(e.combination, 0)),
+                    jnp.asarray(intensity_of(stepper, e)), ahead, jax.random.split(push_key, len(units)))  # fmt: skip
+    return _summary(np.asarray(drawn), log_weights, about_first=e.intensity is None)
+
+
+def _model(stepper: Stepper) -> tuple[Any, Any, Any]:
+    """What moves the first recording."""
+    return stepper.problem.equations, stepper.problem.integrator, stepper.courses[0]
+
+
+def _by_all_rows(
+    stepper: Stepper, e: Estimate, root: np.ndarray, units: Float[np.ndarray, "draw local"]
+) -> tuple[Array, Float[np.ndarray, " draw"]]:
+    """Phase points at the last row, and log weights, of draws given all rows; the first is the most probable one."""
+    problem, given = stepper.problem, stepper.problem.rows[0].readings
+    known = taught(stepper, e, root)
+    zs = jnp.asarray(_within(problem, known.mean + units @ known.root.T))
+    seen, states = _run_through(*_model(stepper), zs, jnp.asarray(problem.onehot(e.combination, 0)))
+    return states[:, len(given) - 1], known.log_weights(units, np.asarray(seen)[:, : len(given)], given)
+
+
+def _filtered(stepper: Stepper, e: Estimate, zs: Array, key: Array) -> Array:
+    """Draws of the phase point at the last row under a missing force, each filtered through all rows."""
+    problem, course = stepper.problem, stepper.courses[0]
+    length = course.times.shape[0]
+    fixed = (total_noise(e), intensity_of(stepper, e), softness(problem, course, e.z, 0), start_spread(stepper, e, 0),
+             padded(problem.rows[0].readings, length, np.nan), row_roots(problem, 0, length, colour_ratio(e)),
+             problem.onehot(e.combination, 0))  # fmt: skip
+    keys = jax.random.split(key, len(zs))
+    return _filter_through(*_model(stepper), zs, tuple(map(jnp.asarray, fixed)), keys)
+
+
+def _ahead(problem: Problem, recording: Recording, times: np.ndarray) -> tuple[Span, Array, Array]:
+    """Spans, times and inputs from the last row on."""
+    spans = problem.rows[0].spans
+    path = np.concatenate([problem.rows[0].times[-1:], times])
+    pieces = max(1, math.ceil(np.max(np.diff(path)) / float(np.max(spans.step)) - 1e-9))
     inputs = np.zeros((len(times), 0)) if recording.inputs is None else recording.inputs.at(times)
-    ahead = (spans_between(path, pieces, recording.inputs), jnp.asarray(times), jnp.asarray(inputs))
-    intensity = jnp.asarray(intensity_of(stepper, e))
-    drawn = _run_on(*model, jnp.asarray(zs), ends, onehot, intensity, ahead, jax.random.split(push_key, len(zs)))
-    return _summary(np.asarray(drawn), weights, about_first=e.intensity is None)
+    return spans_between(path, pieces, recording.inputs), jnp.asarray(times), jnp.asarray(inputs)
 
 
 def _summary(
@@ -105,10 +128,10 @@ def _summary(
     """Mean and sd of draws that stayed finite, or the first and the deviations from it; `InputError` where hardly any
     did."""
     good = np.isfinite(drawn).all((1, 2)) & np.isfinite(log_weights)
-    if good.sum() < _DRAWS // 4 or (about_first and not good[0]):
+    if good.sum() < _DRAWS // 4:
         raise InputError("--forecast-until: the trajectory diverges before that time; give an earlier one")
     weights = softened(log_weights[good], least=min(_LEAST, float(good.sum())))
-    centre = drawn[0] if about_first else np.einsum("d,dtc->tc", weights, drawn[good])
+    centre = drawn[0] if about_first and good[0] else np.einsum("d,dtc->tc", weights, drawn[good])
     return centre, np.sqrt(np.einsum("d,dtc->tc", weights, (drawn[good] - centre) ** 2))
 
 
