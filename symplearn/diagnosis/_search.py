@@ -145,7 +145,9 @@ class Search:
         """Fit and weigh the best combinations anew with another stepper of the same recordings."""
         w, before = self.weigher, self.found
         ranked = sorted(before.estimates, key=before.best, reverse=True)[:_AGAIN]
-        kept = [c for c in ranked if before.best(c) > before.best(ranked[0]) - _REACH]
+        # What did not converge may promise more than there is; it stays, but nothing falls behind it.
+        sound = [e.log_evidence for c in ranked for e in before.estimates[c] if e.converged]
+        kept = [c for c in ranked if before.best(c) > max(sound, default=-np.inf) - _REACH]
         w.moved_to(stepper, Found(stepper.problem, before.priors, complete=before.complete))
         mine = [c for c in dict.fromkeys([self.base, *kept]) if set(self.base) <= set(c)]
         w.weigh([Start(c, white.z, 0.0) for c in mine if (white := before.of(c, "white"))], whole=True)
