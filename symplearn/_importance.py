@@ -32,7 +32,8 @@ _LEARNT = 0.25
 # Below this Pareto k the weights have a variance.
 _VARIANCE = 0.5
 # Draws go on while one has a larger share than this, since its copies count as one effective draw. Of ten posteriors of
-# Henon-Heiles all have 600 effective draws of 1600 then, by 11,000 evaluations; at twice the share two in ten have 400.
+# Henon-Heiles all have 600 effective draws of 1600 then, by 11,000 evaluations; at twice this share two of eight have
+# 400.
 _LARGEST_SHARE = 5e-3
 
 

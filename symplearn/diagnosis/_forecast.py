@@ -18,7 +18,7 @@ from .._triangular import semidefinite_cholesky
 from ._outlook import colour_ratio, intensity_of, start_spread, total_noise
 from ._problem import Problem
 from ._record import Forecast
-from ._stochastic import filter_lane, padded, row_roots, softness
+from ._stochastic import filter_lane, padded, row_roots, run_lane, softness
 from ._taught import root_of, taught
 from ._trajectory import Stepper, effect_coefficients, model_at
 from ._weighed import Estimate
@@ -149,13 +149,7 @@ def _run_through(equations: Any, integrator: Any, course: Any, zs: Array, onehot
 
     def one(z: Array) -> tuple[Array, Array]:
         coefficients = effect_coefficients(z[state + f :], onehot)
-        flow, read = model_at(equations, integrator, course, z[state : state + f], coefficients)
-
-        def step(x: Array, row: tuple[Span, Array, Array]) -> tuple[Array, tuple[Array, Array]]:
-            span, t, u = row
-            return flow(x, span), (read(x, (t, u)), x)
-
-        return jax.lax.scan(step, z[:state], (course.spans, course.times, course.inputs))[1]
+        return run_lane(equations, integrator, course, z[state : state + f], coefficients, z[:state], 0)
 
     return jax.lax.map(one, zs, batch_size=16)
 

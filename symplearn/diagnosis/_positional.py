@@ -74,7 +74,7 @@ def weigh_positional(problem: Problem, fits: Fits, priors: Priors, rows: Sequenc
         grams, logs = np.stack([gram for gram, _ in both]), np.array([log for _, log in both])
         number = np.array([one.number for one in channels])
         one = correlated(problem, fits, b, grams, logs, number, sum(occam), priors)
-        out.append(_told(problem, one, fits.z[b], channels, ratios))
+        out.append(_told(problem, one, fits.z[b], channels, ratios, grams))
     return out
 
 
@@ -113,8 +113,9 @@ def _ratio(problem: Problem, one: _Channel, j: int) -> tuple[float, float]:
 
 
 def _told(
-    problem: Problem, one: Estimate, begin: np.ndarray, channels: Sequence[_Channel], ratios: Sequence[float]
-) -> Estimate:
+    problem: Problem, one: Estimate, begin: np.ndarray, channels: Sequence[_Channel], ratios: Sequence[float],
+    grams: Float[np.ndarray, "channel column column"],
+) -> Estimate:  # fmt: skip
     """With what heavier tails gain, the noise that the error adds to, and how far from white the scores are that it
     leaves."""
     column = np.concatenate([[1.0], begin - one.z])
@@ -123,12 +124,12 @@ def _told(
     total = np.sqrt(np.maximum(errors / number, one.noise**2))
     cleared = [c.cleared(ratio) for c, ratio in zip(channels, ratios, strict=True)]
     scores = sum(x[1:] * (column @ x) / noise**2 for x, noise in zip(cleared, one.noise, strict=True))
-    left = [_left(c, column @ x, column, ratio) for c, x, ratio in zip(channels, cleared, ratios, strict=True)]
+    squares = np.einsum("i,jik,k->j", column, grams, column)
+    left = [_left(c.seen, column @ x, square) for c, x, square in zip(channels, cleared, squares, strict=True)]
     value = one.log_evidence + law_gain(problem, one.combination, np.stack(left, axis=1) / one.noise)
     return replace(one, kind="positional", noise=total, log_evidence=value, inflation=variance_inflation(scores.T))
 
 
-def _left(one: _Channel, errors: np.ndarray, column: np.ndarray, ratio: float) -> Float[np.ndarray, " row"]:
+def _left(seen: Bool[np.ndarray, " row"], errors: np.ndarray, square: float) -> Float[np.ndarray, " row"]:
     """Errors that the polynomials leave, NaN where nothing was read; of the size that the evidence takes them for."""
-    square = float(column @ one.marginal(ratio)[0] @ column)
-    return np.where(one.seen, errors * np.sqrt(max(square, 0.0) / max(float((errors**2).sum()), 1e-300)), np.nan)
+    return np.where(seen, errors * np.sqrt(max(square, 0.0) / max(float((errors**2).sum()), 1e-300)), np.nan)

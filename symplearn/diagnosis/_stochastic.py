@@ -154,7 +154,7 @@ def free_run(
     """Readings and phase points from row `start` on of a run that begins at `x` there and looks at no reading."""
     coefficients = problem.coefficients(recording, z, combination) - problem.coefficients(recording, z, ())
     head, f = problem.head, problem.calibrated.size
-    readings, states = _run(
+    readings, states = run_lane(
         problem.equations,
         problem.integrator,
         course,
@@ -168,7 +168,8 @@ def free_run(
 
 
 @eqx.filter_jit
-def _run(equations: Any, integrator: ig.AbstractIntegrator, course: Course, calibrated, coefficients, x, start):
+def run_lane(equations: Any, integrator: ig.AbstractIntegrator, course: Course, calibrated, coefficients, x, start):
+    """Readings and phase points of all rows, of a run that begins at `x` in row `start`."""
     flow, read = model_at(equations, integrator, course, calibrated, coefficients)
 
     def step(x, row):
