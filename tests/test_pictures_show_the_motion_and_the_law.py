@@ -7,16 +7,17 @@ import re
 import numpy as np
 import pytest
 import report_cases as cases
+from matplotlib.figure import Figure
 from PIL import Image
 
 from symplearn._vocabulary import VOCABULARY
 from symplearn.report import html_report
 from symplearn.report._decimate import envelope
-from symplearn.report._force import missing
+from symplearn.report._force import force_panels, missing
 from symplearn.report._law import Motion, added_force
 from symplearn.report._motion import channel, close_up_window, motion_panels
-from symplearn.report._palette import AFTER, BEFORE, READING, SHADE
-from symplearn.report._panel import limits
+from symplearn.report._palette import AFTER, BEFORE, LAW, READING, SHADE
+from symplearn.report._panel import labels, limits, render
 
 
 def test_eight_long_recordings_stay_small():
@@ -81,6 +82,33 @@ def test_colours_in_pictures_are_true():
         # Pillow looks colours up in cells of 4 levels.
         assert np.abs(seen - asked).max(axis=1).min() <= 3
     assert [255, 255, 255] in seen.tolist()
+
+
+def test_a_law_far_beyond_the_estimate_is_in_the_picture():
+    """A force ten ranges of the estimate away, as where nothing reads its coordinate, is drawn in all three panels."""
+    record = cases.damped_pendulum()
+    one = missing(record, record.series[0], 1, record.coordinates[0])
+    far = dataclasses.replace(one, law=np.full(len(one.times), one.before.max() + 10 * np.ptp(one.before)))
+    for panel in force_panels(far, "theta"):
+        image = np.asarray(Image.open(io.BytesIO(panel.png)).convert("RGB"))
+        below_the_legend = image[image.shape[0] // 10 :].reshape(-1, 3).astype(int)
+        asked = np.array(list(bytes.fromhex(LAW[1:])))
+        assert (np.abs(below_the_legend - asked).max(axis=1) <= 3).sum() > 20
+
+
+def test_a_common_factor_stands_in_the_label():
+    """The power of ten of small numbers is part of the axis' label, not above the axes, where the legend is."""
+    kept = []
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        axes.plot([0.0, 1.0], [0.0, 3e-7])
+        labels(axes, "time", "force [N]")
+        kept.append(axes)
+
+    render(draw, (4.8, 3.0), dpi=40)
+    assert kept[0].get_ylabel().startswith("force [N] × 1e") and kept[0].get_ylabel().endswith("7")
+    assert not kept[0].yaxis.get_offset_text().get_visible()
 
 
 def test_very_short_recordings_are_drawn():

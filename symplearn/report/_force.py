@@ -14,6 +14,8 @@ from ._palette import AFTER, LAW
 from ._panel import Panel, finite, first_look, labels, legend, limits, line, panel, with_unit
 from ._units import force_unit, time_unit
 
+_LAW = 30.0  # ranges of the estimate that a law may lie outside of it and is in the picture still
+
 
 @dataclass(frozen=True, eq=False)
 class Missing:
@@ -65,8 +67,11 @@ def force_panels(one: Missing, coordinate: str) -> list[Panel]:
 
 
 def _force_limits(one: Missing) -> tuple[float, float]:
-    others = [series for series in (one.after, one.law) if series is not None]
-    return limits(one.before, *others)
+    low, high = limits(one.before, *([] if one.after is None else [one.after]))
+    if one.law is None:
+        return low, high
+    # Where nothing reads a coordinate, the estimate is far smaller than the force that the law says.
+    return limits(np.array([low, high]), one.law, most=_LAW)
 
 
 def _over_time(axes: Axes, one: Missing) -> None:

@@ -65,10 +65,22 @@ def render(draw: Callable[[Figure], None], size: tuple[float, float], dpi: int) 
         canvas = FigureCanvasAgg(figure)
         draw(figure)
         canvas.draw()
+        if any([_factor_beside_its_label(axes) for axes in figure.axes]):
+            canvas.draw()
         image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     file = io.BytesIO()
     in_palette(image).save(file, "PNG")
     return file.getvalue()
+
+
+def _factor_beside_its_label(axes: Axes) -> bool:
+    """Move the common factor of the vertical axis, which only drawing finds, from where the legend is to the label."""
+    factor = axes.yaxis.get_offset_text()
+    if not (text := factor.get_text()):
+        return False
+    axes.set_ylabel(f"{axes.get_ylabel()} × {text}")
+    factor.set_visible(False)
+    return True
 
 
 def labels(axes: Axes, x: str, y: str) -> None:
@@ -95,8 +107,10 @@ def first_look(changed: bool) -> dict[str, Any]:
     return {"color": BEFORE, "label": "before"} if changed else {"color": AFTER, "label": "simulation"}
 
 
-def limits(anchor: Float[np.ndarray, "..."], *others: Float[np.ndarray, "..."]) -> tuple[float, float]:
-    """The range of `anchor`, widened for `others` by no more than its own size.
+def limits(
+    anchor: Float[np.ndarray, "..."], *others: Float[np.ndarray, "..."], most: float = 1.0
+) -> tuple[float, float]:
+    """The range of `anchor`, widened for `others` by no more than `most` times its own size.
 
     A simulation that diverges then flattens nothing.
     """
@@ -105,7 +119,8 @@ def limits(anchor: Float[np.ndarray, "..."], *others: Float[np.ndarray, "..."]) 
         values = np.concatenate([finite(o) for o in others] + [np.zeros(1)])
     low, high = float(values.min()), float(values.max())
     size = (high - low) or abs(high) or 1.0
-    near = np.concatenate([np.clip(finite(o), low - size, high + size) for o in others] + [values])
+    room = most * size
+    near = np.concatenate([np.clip(finite(o), low - room, high + room) for o in others] + [values])
     low, high = float(near.min()), float(near.max())
     margin = 0.06 * ((high - low) or size)
     return low - margin, high + margin
