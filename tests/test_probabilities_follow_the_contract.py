@@ -125,7 +125,7 @@ def test_members_in_some_recordings_share_what_their_target_has(recordings):
         once = problem.candidate(m).effect.name == "impulse" and recordings > 1
         variants = [v for v in problem.variants(m) if not once or len(problem.members[v].recordings) == 1]
         members += variants if once else [m, *variants]
-    fits = [estimate(problem, (), 1.0, kind) for kind in ("white", "coloured", "positional", "force")]
+    fits = [estimate(problem, (), 1.0, kind) for kind in ("white", "coloured", "clock", "positional", "force")]
     p = posterior(problem, found(problem, *fits, *(estimate(problem, (m,), 1.0) for m in members)), 1.0)
     assert p.as_it_is == pytest.approx(0.5, rel=1e-9) and p.unexplained == pytest.approx(0.5 / FAMILIES, rel=1e-9)
     whole, part = {}, {}
@@ -171,7 +171,7 @@ def test_a_narrower_search_shares_among_what_is_left():
 @pytest.mark.parametrize("value", [0.0, -1234.5, 5678.9])
 def test_equal_evidences_give_the_prior_back(problem, value):
     """Where all explain alike: 1/2 for nothing, 1/8 for the unexplained, half its price for each effect."""
-    fits = [estimate(problem, (), value, kind) for kind in ("white", "coloured", "positional", "force")]
+    fits = [estimate(problem, (), value, kind) for kind in ("white", "coloured", "clock", "positional", "force")]
     fits += [estimate(problem, c, value) for c in singles(problem)]
     p = posterior(problem, found(problem, *fits), 1.0)
     # Evidences of some thousands keep twelve digits behind the point.
@@ -188,7 +188,7 @@ def test_probabilities_add_to_one_and_come_likeliest_first(problem):
     fits = [
         estimate(problem, c, 4 * rng.normal(), kind)
         for c in everything
-        for kind in ("white", "coloured", "positional", "force")
+        for kind in ("white", "coloured", "clock", "positional", "force")
     ]
     p = posterior(problem, found(problem, *fits), 1.0)
     named = [w.probability for w in p.named]
@@ -219,10 +219,10 @@ def test_a_combination_pays_every_members_price(problem):
 def test_a_remainder_beside_a_finding_costs_its_familys_share(problem):
     """An effect with a remainder is weighed as the effect alone is, at the price of `any`, shared by its kinds."""
     one = (place(problem, "viscous_damping", "q1"),)
-    values = (("white", 0.0), ("coloured", 3.0), ("positional", 2.0), ("force", 1.0))
+    values = (("white", 0.0), ("coloured", 3.0), ("clock", 1.5), ("positional", 2.0), ("force", 1.0))
     kinds = [estimate(problem, one, value, kind) for kind, value in values]
     p = posterior(problem, found(problem, estimate(problem, (), 0.0), *kinds), 1.0)
-    expected = DAMPING * (1 + 1 / FAMILIES * (np.exp(3.0) + np.exp(2.0) + np.exp(1.0)) / 3)
+    expected = DAMPING * (1 + 1 / FAMILIES * sum(map(np.exp, (3.0, 1.5, 2.0, 1.0))) / 4)
     assert p.named[0].probability / p.as_it_is == pytest.approx(expected, rel=1e-9)
     assert p.named[0].best.kind == "coloured"
 

@@ -38,6 +38,12 @@ from ._weighed import Estimate, coloured_inflation
 from ._words import equation_lines, finding_sentence, next_measurement
 
 VERSION = "0.1.0"
+# How readings are off, by kind of remainder.
+_WAYS = {
+    "coloured": "that remembers itself",
+    "clock": "that goes with how fast they change, as where they are read too early or too late",
+    "positional": "that goes with what is read",
+}
 
 
 class Answer:
@@ -273,10 +279,9 @@ class Answer:
     def _unexplained_location(self) -> dict[str, Any]:
         eq, several = self.problem.equations, len(self.lens) > 1
         # A nearly periodic remainder goes with the motion, so a force is likelier than an error of the sensor.
-        remembered = self.before.kind == "coloured" and all(colour.damping >= 1 for colour in self.before.colours)
-        if remembered or self.before.kind == "positional":
+        remembered = all(colour.damping >= 1 for colour in (*self.before.colours, *self.before.clocks))
+        if remembered and (way := _WAYS.get(self.before.kind)):
             kind, targets = "sensor", list(eq.columns)
-            way = "that remembers itself" if remembered else "that goes with what is read"
             where = f"the readings are off in a way {way}, without a name in the vocabulary"
             windows = whole_windows(self.lens)
         else:

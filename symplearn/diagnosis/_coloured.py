@@ -3,7 +3,8 @@
 The process is the damped oscillator of second order driven by white noise: rough like Ornstein-Uhlenbeck's at strong
 damping, smooth like Matern's of order 3/2 at critical damping, nearly periodic at weak damping. A Kalman filter
 for it whitens residuals and sensitivities alike, so one pass gives the Gram matrix from which generalised least
-squares and the evidence follow (Jones 1980; Harvey 1989, section 3.4; Sarkka and Solin 2019, section 12.3).
+squares and the evidence follow (Jones 1980; Harvey 1989, section 3.4; Sarkka and Solin 2019, section 12.3). Several
+such processes may add up, each entering a row by a factor of its own.
 """
 
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ _RATIOS = np.geomspace(0.03, 1e6, 12)
 _DAMPINGS = (30.0, 1.001, 0.3, 0.1)
 _TIMES = 10
 # Rows that the grid is searched with; more would not tell the colour better.
-_ROWS = 4000
+MOST_ROWS = 4000
 # Lanes whitened together.
 _LANES = 8
 # Rows are filled up to a multiple of this, so that recordings share compiled functions.
@@ -52,54 +53,79 @@ def _transition(gap: Array, frequency: Array, damping: Array) -> Array:
     return jnp.array([[c + rate * s, s], [-(frequency**2) * s, c - rate * s]])
 
 
-def _filter(columns, variances, gaps, ratio, frequency, damping, visit, start):
-    """Filter the error's state for every column; `visit(total, e, S)` gathers innovations, `start` its first value."""
-    stationary = ratio * jnp.diag(jnp.stack([jnp.ones_like(frequency), frequency**2]))
+def remembered(columns, loadings, variances, gaps, shapes, visit, start):
+    """Filter the errors' state for every column; `visit(total, e, S)` gathers innovations, `start` its first value.
+
+    `shapes` are ratio, frequency and damping of one process or several, and `loadings` (process, row) the factors by
+    which they enter each row.
+    """
+    ratio, frequency, damping = shapes
+    number = len(ratio)
+    stationary = jnp.diag((ratio[:, None] * jnp.stack([jnp.ones_like(frequency), frequency**2], axis=1)).ravel())
 
     def step(carry, data):
         M, P, total, logs = carry
-        y, r, gap = data
+        y, h, r, gap = data
+        H = (h[:, None] * jnp.array([1.0, 0.0])).ravel()
         seen = r > 0
-        S = jnp.where(seen, P[0, 0] + r, 1.0)
-        e = jnp.where(seen, y - M[0], 0.0)
-        K = jnp.where(seen, P[:, 0] / S, 0.0)
+        S = jnp.where(seen, H @ P @ H + r, 1.0)
+        e = jnp.where(seen, y - H @ M, 0.0)
+        K = jnp.where(seen, P @ H / S, 0.0)
         total, kept = visit(total, e, S)
         M, P = M + K[:, None] * e, P - jnp.outer(K, K) * S
-        F = _transition(gap, frequency, damping)
+        F = jnp.zeros_like(P)
+        for i in range(number):
+            F = F.at[2 * i : 2 * i + 2, 2 * i : 2 * i + 2].set(_transition(gap, frequency[i], damping[i]))
         P = stationary + F @ (P - stationary) @ F.T
         return (F @ M, P, total, logs + jnp.where(seen, jnp.log(S), 0.0)), kept
 
-    begin = (jnp.zeros((2, columns.shape[0])), stationary, start, jnp.zeros(()))
-    (_, _, total, logs), kept = jax.lax.scan(step, begin, (columns.T, variances, gaps))
+    begin = (jnp.zeros((2 * number, columns.shape[0])), stationary, start, jnp.zeros(()))
+    (_, _, total, logs), kept = jax.lax.scan(step, begin, (columns.T, loadings.T, variances, gaps))
     return total, logs, kept
 
 
-def _squares(columns, variances, gaps, ratio, frequency, damping):
+def squares(columns, loadings, variances, gaps, shapes):
+    """Sum of the first column's squared whitened innovations, and of the log innovation variances."""
+
     def visit(total, e, S):
         return total + e[0] ** 2 / S, None
 
-    return _filter(columns, variances, gaps, ratio, frequency, damping, visit, jnp.zeros(()))[:2]
+    return remembered(columns, loadings, variances, gaps, shapes, visit, jnp.zeros(()))[:2]
 
 
-def _gram(columns, variances, gaps, ratio, frequency, damping):
+def gram(columns, loadings, variances, gaps, shapes):
+    """Gram matrix of the whitened columns, and the sum of the log innovation variances."""
+
     def visit(total, e, S):
         return total + jnp.outer(e, e) / S, None
 
     size = columns.shape[0]
-    return _filter(columns, variances, gaps, ratio, frequency, damping, visit, jnp.zeros((size, size)))[:2]
+    return remembered(columns, loadings, variances, gaps, shapes, visit, jnp.zeros((size, size)))[:2]
 
 
-@jax.jit
-def _series(columns, variances, gaps, ratio, frequency, damping):
+def series(columns, loadings, variances, gaps, shapes):
+    """The whitened columns, row by row."""
+
     def visit(total, e, S):
         return total, e / jnp.sqrt(S)
 
-    return _filter(columns, variances, gaps, ratio, frequency, damping, visit, jnp.zeros(()))[2]
+    return remembered(columns, loadings, variances, gaps, shapes, visit, jnp.zeros(()))[2]
 
 
-_lanes = jax.jit(jax.vmap(_series, (0, None, None, 0, 0, 0)))
-_on_grid = jax.jit(jax.vmap(jax.vmap(_squares, (None, None, None, 0, 0, 0)), (0, None, None, None, None, None)))
-_grams = jax.jit(jax.vmap(_gram, (0, None, None, 0, 0, 0)))
+def _alone(what):
+    """One process, of the same size in every row."""
+
+    def done(columns, variances, gaps, ratio, frequency, damping):
+        shapes = (ratio[None], frequency[None], damping[None])
+        return what(columns, jnp.ones((1, columns.shape[1])), variances, gaps, shapes)
+
+    return done
+
+
+_series = jax.jit(_alone(series))
+_lanes = jax.jit(jax.vmap(_alone(series), (0, None, None, 0, 0, 0)))
+_on_grid = jax.jit(jax.vmap(jax.vmap(_alone(squares), (None, None, None, 0, 0, 0)), (0, *[None] * 5)))
+_grams = jax.jit(jax.vmap(_alone(gram), (0, None, None, 0, 0, 0)))
 
 
 def _chunks(lanes: int) -> list[np.ndarray]:
@@ -108,22 +134,22 @@ def _chunks(lanes: int) -> list[np.ndarray]:
     return list(places.reshape(-1, _LANES))
 
 
-def _variances(weight: np.ndarray) -> Array:
+def row_variances(weight: np.ndarray) -> Array:
     """White variance of every row in units of one reading's; 0 marks a missing one."""
-    return _filled(np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0))
+    return filled(np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0))
 
 
-def _gaps(times: np.ndarray) -> Array:
-    return _filled(np.append(np.diff(times), 0.0))
+def row_gaps(times: np.ndarray) -> Array:
+    return filled(np.append(np.diff(times), 0.0))
 
 
-def _filled(values: np.ndarray) -> Array:
+def filled(values: np.ndarray) -> Array:
     """Rows filled up with zeros to a round number: missing ones without gaps, which change nothing."""
     lack = -values.shape[-1] % _ROUND
     return jax.device_put(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, lack)]))
 
 
-def _grid(times: list[np.ndarray]) -> np.ndarray:
+def grid_of(times: list[np.ndarray]) -> np.ndarray:
     """Every (ratio, frequency, damping) that is tried: memories from one gap to a quarter of the recording."""
     gap = min(float(np.median(np.diff(t))) for t in times)
     memories = np.geomspace(gap, max(t[-1] - t[0] for t in times) / 4, _TIMES)
@@ -143,25 +169,25 @@ def fit_colour(
     gives it; None where it is profiled out. - `largest`: the largest sd of the coloured error; one as large as the
     signal would explain everything and mean nothing.
     """
-    grid = _grid(times)
+    grid = grid_of(times)
     ratio, frequency, damping = (jax.device_put(grid[:, i]) for i in range(3))
     square: Any = 0.0
     logs: Any = 0.0
     number = 0
     for x, w, t in zip(residuals, weight, times, strict=True):
-        some = slice(max(0, (len(t) - _ROWS) // 2), max(0, (len(t) - _ROWS) // 2) + _ROWS)
-        rows = _variances(w[some]), _gaps(t[some])
-        parts = [_on_grid(_filled(x[c][:, None, some]), *rows, ratio, frequency, damping) for c in _chunks(len(x))]
+        some = slice(max(0, (len(t) - MOST_ROWS) // 2), max(0, (len(t) - MOST_ROWS) // 2) + MOST_ROWS)
+        rows = row_variances(w[some]), row_gaps(t[some])
+        parts = [_on_grid(filled(x[c][:, None, some]), *rows, ratio, frequency, damping) for c in _chunks(len(x))]
         square = square + np.concatenate([np.asarray(a) for a, _ in parts])[: len(x)]
         logs = logs + np.concatenate([np.asarray(b) for _, b in parts])[: len(x)]
         number += int((w[some] > 0).sum())
     white = np.maximum(square, 1e-300) / number if known is None else np.full_like(square, known**2)
     value = -0.5 * (number * np.log(white) + square / white + logs)
     value = np.where(np.isfinite(value) & (grid[:, 0] * white <= largest**2), value, -np.inf)
-    return [_chosen(grid, v) for v in value]
+    return [chosen(grid, v) for v in value]
 
 
-def _chosen(grid: np.ndarray, values: np.ndarray) -> Colour:
+def chosen(grid: np.ndarray, values: np.ndarray) -> Colour:
     best = int(values.argmax())
     if not np.isfinite(values[best]):
         best, occam = 0, -np.inf
@@ -179,8 +205,8 @@ def whitened_gram(
 ) -> tuple[Float[np.ndarray, "lane column column"], Float[np.ndarray, " lane"]]:
     """Gram matrix of the whitened columns in units of the white variance, and the sum of log innovation variances."""
     shape = [np.array([getattr(c, f) for c in colours]) for f in ("ratio", "frequency", "damping")]
-    rows = _variances(weight), _gaps(times)
-    parts = [_grams(_filled(columns[c]), *rows, *(jax.device_put(s[c]) for s in shape)) for c in _chunks(len(columns))]
+    rows = row_variances(weight), row_gaps(times)
+    parts = [_grams(filled(columns[c]), *rows, *(jax.device_put(s[c]) for s in shape)) for c in _chunks(len(columns))]
     total, logs = (np.concatenate([np.asarray(part[i]) for part in parts])[: len(columns)] for i in range(2))
     return total, logs
 
@@ -193,8 +219,8 @@ def whitened_residuals(
 ) -> Float[np.ndarray, "lane time"]:
     """Every lane's residuals whitened by its own colour, in units of its white sd."""
     shape = [np.array([getattr(c, f) for c in colours]) for f in ("ratio", "frequency", "damping")]
-    rows = _variances(weight), _gaps(times)
-    parts = [_lanes(_filled(residuals[c][:, None]), *rows, *(jax.device_put(s[c]) for s in shape))
+    rows = row_variances(weight), row_gaps(times)
+    parts = [_lanes(filled(residuals[c][:, None]), *rows, *(jax.device_put(s[c]) for s in shape))
              for c in _chunks(len(residuals))]  # fmt: skip
     return np.concatenate([np.asarray(part)[..., 0] for part in parts])[: len(residuals), : len(times)]
 
@@ -207,4 +233,4 @@ def whitened_series(
 ) -> Float[np.ndarray, "time column"]:
     """The whitened columns of one lane, row by row, in units of the white sd."""
     shape = (jax.device_put(x) for x in (colour.ratio, colour.frequency, colour.damping))
-    return np.asarray(_series(_filled(columns), _variances(weight), _gaps(times), *shape))[: len(times)]
+    return np.asarray(_series(filled(columns), row_variances(weight), row_gaps(times), *shape))[: len(times)]

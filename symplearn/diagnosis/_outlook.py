@@ -17,8 +17,9 @@ from ._weighed import Estimate
 
 
 def colour_ratio(estimate: Estimate) -> Float[np.ndarray, " channel"]:
-    """Variance of the coloured reading error over the white one, by channel; zero where there is none."""
-    return np.array([c.ratio for c in estimate.colours]) if estimate.colours else np.zeros(len(estimate.noise))
+    """Variance of the reading error with a memory over the white one, by channel; zero where there is none."""
+    both = [estimate.colours, estimate.clocks]
+    return sum((np.array([c.ratio for c in each]) for each in both if each), np.zeros(len(estimate.noise)))
 
 
 def total_noise(estimate: Estimate) -> Float[np.ndarray, " channel"]:

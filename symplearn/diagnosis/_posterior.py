@@ -20,7 +20,7 @@ CONSISTENT = 0.05
 # Prior share of a change in time that begins anew in every one of several recordings.
 _ANEW = 1.0 / 30.0
 # Kinds of remainder other than white noise; each combination divides its remainder's prior among them.
-_REMAINDERS = ("coloured", "positional", "force")
+_REMAINDERS = ("coloured", "clock", "positional", "force")
 
 
 @dataclass(frozen=True)

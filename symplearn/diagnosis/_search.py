@@ -82,6 +82,7 @@ class Search:
                 break
         self._move_places()
         self._weigh_subsets()
+        self._weigh_clocks()
         self.progress("weighing missing forces beside the best combinations")
         self._weigh_forces()
         self.weigher.weigh_with_outliers_in()
@@ -152,6 +153,7 @@ class Search:
         mine = [c for c in dict.fromkeys([self.base, *kept]) if set(self.base) <= set(c)]
         w.weigh([Start(c, white.z, 0.0) for c in mine if (white := before.of(c, "white"))], whole=True)
         w.add_paths(fit_paths(w.stepper, self.null_paths, w.found.priors, self.rows, 3))
+        self._weigh_clocks()
         self._weigh_forces()
         w.weigh_with_outliers_in()
         return self.found
@@ -361,6 +363,17 @@ class Search:
         for member, place in self.problem.placed(combination):
             z[place] = white.z[where[member]]
         return z
+
+    def _weigh_clocks(self) -> None:
+        """The best combinations again where the clock may run ahead and behind; none where the very best leaves no
+        remainder."""
+        ranked = sorted(self.found.estimates, key=self.found.best, reverse=True)
+        top = self.found.best(ranked[0])
+        white = self.found.of(ranked[0], "white")
+        if white is None or white.log_evidence < top:
+            self.progress("weighing errors of the clock")
+            near = [c for c in ranked if self.found.best(c) > top - _REACH][:KEPT]
+            self.weigher.weigh_clocks(list(dict.fromkeys([*near, self.base])))
 
     def _weigh_forces(self) -> None:
         """Best combinations again, each with a missing force beside it; only the very best where that needs none."""

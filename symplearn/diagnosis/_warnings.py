@@ -14,6 +14,7 @@ from ._weighed import Estimate
 # What is left beside the findings, by kind of remainder.
 _REMAINDERS = {
     "coloured": "an error of the sensor",
+    "clock": "an error of the clock",
     "positional": "an error of the sensor that goes with what it reads",
     "force": "a small missing force",
 }

@@ -30,9 +30,9 @@ class Mode:
 class Estimate:
     """A combination fitted under one kind of remainder.
 
-    `kind` is `white` (no remainder), `coloured` (an error of the sensor with a memory), `positional` (one that goes
-    with what is read) or `force` (a white missing force of `intensity`). `noise` is the white sd of one original
-    reading, with the rms of a positional error.
+    `kind` is `white` (no remainder), `coloured` (an error of the sensor with a memory), `clock` (one of its clock
+    beside that), `positional` (one that goes with what is read) or `force` (a white missing force of `intensity`).
+    `noise` is the white sd of one original reading, with the rms of a positional error.
     """
 
     combination: Combination
@@ -46,6 +46,7 @@ class Estimate:
     intensity: Float[np.ndarray, " d"] | None = None
     paths: list[np.ndarray] | None = field(default=None, repr=False)
     colours: tuple[Colour, ...] = ()
+    clocks: tuple[Colour, ...] = ()  # errors of the times, as the rms error of the reading that they make
     modes: tuple[Mode, ...] = ()  # all optima that were found, this one among them
     outliers: tuple[tuple[float, float], ...] = ()  # share and size by channel, where they were left out
 

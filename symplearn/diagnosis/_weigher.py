@@ -8,6 +8,7 @@ import numpy as np
 from .._effects import OUTLIERS, STOP
 from ._along import along, readings
 from ._calibrate import Fits, Priors, grow, residuals, weights
+from ._clock import weigh_clock
 from ._found import Found
 from ._noisy import PathFit, fit_paths
 from ._positional import weigh_positional
@@ -134,6 +135,21 @@ class Weigher:
         for estimate in correlated + weigh_positional(self.problem, fits, priors, self.rows):
             white = self.found.of(estimate.combination, "white")
             self._add(estimate, self.owed[estimate.combination], white.outliers if white else ())
+
+    def weigh_clocks(self, combinations: Sequence[Combination]) -> None:
+        """Weigh combinations, fitted before, where the clock may run ahead and behind beside a coloured error."""
+        found = [self.found.of(c, "white") for c in combinations]
+        whites = [one for one in found if one is not None and self.found.of(one.combination, "coloured")]
+        if not whites:
+            return
+        z, own = np.stack([one.z for one in whites]), [one.combination for one in whites]
+        predictions = self.stepper.predict(z, own, self.rows)
+        noise, converged = np.stack([one.noise for one in whites]), np.array([one.converged for one in whites])
+        fits = Fits(own, z, noise, predictions, np.zeros(len(z)), converged)
+        colours = [one.colours for c in own if (one := self.found.of(c, "coloured"))]
+        for one in weigh_clock(self.problem, fits, self.found.priors, self.rows, colours):
+            white = self.found.of(one.combination, "white")
+            self._add(one, self.owed[one.combination], white.outliers if white else ())
 
     def _whites(self, fits: Fits, rows: list[int]) -> np.ndarray:
         """Log evidences under white noise, by lane, with what unfinished fits promise."""
