@@ -11,6 +11,8 @@ from ._weighed import Estimate, Mode
 
 # Two optima whose places differ by more than this many standard deviations are two modes.
 _APART = 2.0
+# Nats that an estimate which did not converge must be ahead to be reported nevertheless.
+UNCONVERGED = 3.0
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,8 @@ class Found:
         elif np.isfinite(one.log_evidence):
             modes.append(one)
         top = max(mode.log_evidence for mode in modes)
-        better = new if one.log_evidence >= max(mode.log_evidence for mode in old.modes) else old
+        lead = UNCONVERGED * (int(old.converged) - int(new.converged))
+        better = new if one.log_evidence >= max(mode.log_evidence for mode in old.modes) + lead else old
         total = float(logsumexp([mode.log_evidence for mode in modes])) if np.isfinite(top) else -np.inf
         return replace(better, log_evidence=total, modes=tuple(modes))
 

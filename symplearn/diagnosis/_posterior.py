@@ -6,15 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._effects import IMPULSE, prices
-from ._found import Found
+from ._found import UNCONVERGED, Found
 from ._problem import Combination, Problem
 from ._strength import faint_share
 from ._weighed import Estimate
 
 # A coefficient whose posterior is as wide as this share of its prior has learnt nothing from the recording.
 _UNINFORMED = 0.7
-# Nats that an estimate which did not converge must be ahead to be reported nevertheless.
-_UNCONVERGED = 3.0
 # The simulation counts as consistent unless the probability of nothing left out is below this (contract).
 CONSISTENT = 0.05
 # Prior share of a change in time that begins anew in every one of several recordings.
@@ -122,7 +120,7 @@ def _faint(problem: Problem, found: Found, combination: Combination) -> float | 
 
 def _speaker(estimates: Sequence[Estimate]) -> Estimate:
     """The estimate of the best kind of remainder; one that converged is preferred to one barely ahead that did not."""
-    return max(estimates, key=lambda e: e.log_evidence - (0.0 if e.converged else _UNCONVERGED))
+    return max(estimates, key=lambda e: e.log_evidence - (0.0 if e.converged else UNCONVERGED))
 
 
 def _mixture(values: Sequence[float]) -> float:

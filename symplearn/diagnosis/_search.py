@@ -150,8 +150,9 @@ class Search:
         sound = [e.log_evidence for c in ranked for e in before.estimates[c] if e.converged]
         kept = [c for c in ranked if before.best(c) > max(sound, default=-np.inf) - _REACH]
         w.moved_to(stepper, Found(stepper.problem, before.priors, complete=before.complete))
-        mine = [c for c in dict.fromkeys([self.base, *kept]) if set(self.base) <= set(c)]
+        mine = [c for c in dict.fromkeys([self.base, *kept]) if self._is_mine(c)]
         w.weigh([Start(c, white.z, 0.0) for c in mine if (white := before.of(c, "white"))], whole=True)
+        self._move_places()
         w.add_paths(fit_paths(w.stepper, self.null_paths, w.found.priors, self.rows, 3))
         self._weigh_clocks()
         self._weigh_forces()
@@ -184,14 +185,17 @@ class Search:
         return self.found
 
     def _move_places(self) -> None:
-        """Try the best combinations with their times, thresholds and frequencies moved by steps of the grid."""
+        """Try the best combinations with their times, thresholds and frequencies moved by steps of the grid, and those
+        that did not converge from where they are: damped anew, many get where they were going."""
         ranked = sorted(self.found.estimates, key=self.found.best, reverse=True)
-        top = self.found.best(ranked[0])
+        near = [c for c in ranked if self.found.best(c) > self.found.best(ranked[0]) - _NEAR and self._is_mine(c)]
         starts = []
-        for c in [c for c in ranked if self.found.best(c) > top - _NEAR][:_MOVED] if self._in_time() else []:
+        for k, c in enumerate(near if self._in_time() else []):
             white = self.found.of(c, "white")
-            for member, place in self.problem.placed(c):
-                if white is not None and self.problem.candidate(member).effect.places:
+            assert white is not None  # every combination is weighed under white noise first
+            starts += [] if white.converged else [Start(c, white.z, 0.0)]
+            for member, place in self.problem.placed(c) if k < _MOVED else []:
+                if self.problem.candidate(member).effect.places:
                     starts += [Start(c, z, 0.0) for z in self._moved(white.z, member, place.stop - 1)]
         if starts:
             self.progress("moving times, thresholds and frequencies")
@@ -207,6 +211,10 @@ class Search:
                 out.append(z.copy())
                 out[-1][entry] += k * step
         return out
+
+    def _is_mine(self, combination: Combination) -> bool:
+        """Whether the outliers that were taken out are part of it."""
+        return set(self.base) <= set(combination)
 
     def _size(self, combination: Combination) -> int:
         """Effects beside outliers that are taken out."""
@@ -365,11 +373,9 @@ class Search:
         return z
 
     def _weigh_clocks(self) -> None:
-        """The best combinations again where the clock may run ahead and behind; none where the very best leaves no
-        remainder."""
+        """The best combinations again where the clock may wander; none where the very best leaves no remainder."""
         ranked = sorted(self.found.estimates, key=self.found.best, reverse=True)
-        top = self.found.best(ranked[0])
-        white = self.found.of(ranked[0], "white")
+        top, white = self.found.best(ranked[0]), self.found.of(ranked[0], "white")
         if white is None or white.log_evidence < top:
             self.progress("weighing errors of the clock")
             near = [c for c in ranked if self.found.best(c) > top - _REACH][:KEPT]
