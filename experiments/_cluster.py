@@ -5,11 +5,14 @@ with them but what is sent.
 """
 
 import os
+import pickle
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import jax
 
 from symplearn._errors import InputError, shown
 from symplearn._places import AbstractPlace, Cluster, Outcome
@@ -30,7 +33,8 @@ def elsewhere(
         return
     assert run.scheduler is not None
     sent = files or [{}] * len(parts)
-    cases = [(part, run._replace(scheduler=None, out=Path()), each) for part, each in zip(parts, sent, strict=True)]
+    there = run._replace(scheduler=None, out=Path())
+    cases = [(pickle.dumps(part), there, each) for part, each in zip(parts, sent, strict=True)]
     failed: list[Outcome] = []
     with Cluster(run.scheduler, _tell) as cluster:
         for k, outcome in enumerate(_brought(cluster, cases, run.out), 1):
@@ -59,12 +63,15 @@ def _brought(place: AbstractPlace, cases: Sequence[tuple[Any, ...]], out: Path) 
         yield outcome
 
 
-def apart(part: Callable[[Run], Any], run: Run, files: Mapping[str, bytes]) -> tuple[Any, dict[str, bytes]]:
-    """What a part gives in a folder of its own with these files, and the files that it left there."""
+def apart(part: bytes, run: Run, files: Mapping[str, bytes]) -> tuple[Any, dict[str, bytes]]:
+    """What a pickled part gives in a folder of its own with these files, and the files that it left there."""
+    # As where it comes from: an experiment is imported before it turns to double precision, and its constants stay so.
+    with jax.enable_x64(False):
+        work: Callable[[Run], Any] = pickle.loads(part)
     in_double_precision()
     with tempfile.TemporaryDirectory(prefix="symplearn-part-") as folder:
         put_all(Path(folder), files)
-        return part(run._replace(out=Path(folder))), files_in(Path(folder))
+        return work(run._replace(out=Path(folder))), files_in(Path(folder))
 
 
 def files_in(folder: Path) -> dict[str, bytes]:

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from symplearn._errors import InputError
+
 from ._cluster import elsewhere
 from ._command import Run, print_table
 
@@ -45,6 +47,8 @@ def realisations(run: Run, jobs: Sequence[Callable[[Run], dict[str, Any]]], thre
     missing = [job for job in jobs if not _is_kept(run, job)]
     for _ in elsewhere(run, missing):
         pass
+    if not all(_is_kept(run, job) for job in missing):
+        raise InputError("the workers made results of other settings; start them in a checkout of this version")
     yield from (job(run) for job in jobs)
 
 

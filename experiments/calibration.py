@@ -63,12 +63,17 @@ def batch(run: Run, name: str, study: Study, k: int) -> dict[str, Any]:
     return kept(run, f"sbc_{name}", k, study_settings(study), lambda: batch_of(study, name, run.seed, numbers))
 
 
+def batch_called(run: Run, name: str, k: int) -> dict[str, Any]:
+    """One batch of the study of this name: the name alone is sent to a worker."""
+    return batch(run, name, (STUDIES | WRONG)[name], k)
+
+
 def all_ranks(run: Run) -> dict[str, dict[str, Any]]:
     """The simulations of every model, those of the wrong one among them."""
     studies = STUDIES | WRONG
     todo = [(name, k) for k in range(SIMULATIONS[run.quick] // BATCH) for name in studies]
     batches: dict[str, list[dict[str, Any]]] = {name: [] for name in studies}
-    made = realisations(run, [partial(batch, name=name, study=studies[name], k=k) for name, k in todo])
+    made = realisations(run, [partial(batch_called, name=name, k=k) for name, k in todo])
     for (name, _), found in zip(run.each("batches", todo), made, strict=True):
         batches[name].append(found)
     return {name: joined(each) for name, each in batches.items()}

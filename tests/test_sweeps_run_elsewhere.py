@@ -2,6 +2,7 @@
 
 import importlib
 import math
+import pickle
 import sys
 from functools import partial
 
@@ -18,34 +19,37 @@ _realisations = importlib.import_module("experiments._realisations")
 Run = importlib.import_module("experiments._command").Run
 tao = importlib.import_module("experiments.tao")
 
-SWEEPS = ("calibration", "cherry", "concealed", "henon_heiles", "noise_starts", "tao")
+SWEEPS = (
+    "calibration", "cherry", "concealed", "henon_heiles", "noise_starts", "tao",
+)  # fmt: skip
+MADE = []
 
 
 @pytest.fixture
 def workers(monkeypatch):
     """A cluster whose work is done in this process: whoever asks for one is given it."""
     monkeypatch.setattr(_cluster, "Cluster", lambda address, tell: Here())
+    MADE.clear()
 
 
-def realisation(run, k, made):
+def realisation(run, k, settings="settings"):
     """A realisation that counts how often it is made, and fails where k is negative."""
 
     def make():
-        made.append(run.out)
+        MADE.append(run.out)
         return {"root": math.sqrt(k)}
 
-    return _realisations.kept(run, "root", abs(k), "settings", make)
+    return _realisations.kept(run, "root", abs(k), settings, make)
 
 
 def test_realisations_are_kept_as_here_and_made_once(workers, tmp_path):
     """Results come in order, each made in a folder of its own; a second run makes nothing, and here is the same."""
     there, here = Run(tmp_path / "there", scheduler="tcp://HOST:8786"), Run(tmp_path / "here")
-    made = []
-    jobs = [partial(realisation, k=k, made=made) for k in (3, 1, 2)]
+    jobs = [partial(realisation, k=k) for k in (3, 1, 2)]
     found = list(_realisations.realisations(there, jobs))
     assert [one["root"] for one in found] == [math.sqrt(k) for k in (3, 1, 2)]
-    assert len(made) == 3 and there.out not in made
-    assert list(_realisations.realisations(there, jobs)) == found and len(made) == 3
+    assert len(MADE) == 3 and there.out not in MADE
+    assert list(_realisations.realisations(there, jobs)) == found and len(MADE) == 3
     here.out.mkdir()
     assert list(_realisations.realisations(here, jobs)) == found
     assert _cluster.files_in(there.out) == _cluster.files_in(here.out)
@@ -53,13 +57,37 @@ def test_realisations_are_kept_as_here_and_made_once(workers, tmp_path):
 
 def test_what_fails_is_told_and_the_rest_is_kept(workers, tmp_path):
     """One sentence counts the parts that failed; the same command then makes those alone."""
-    run, made = Run(tmp_path, scheduler="tcp://HOST:8786"), []
-    jobs = [partial(realisation, k=k, made=made) for k in (4, -1, 9)]
+    run = Run(tmp_path, scheduler="tcp://HOST:8786")
+    jobs = [partial(realisation, k=k) for k in (4, -1, 9)]
     with pytest.raises(InputError, match="1 of 3 parts failed, the first as ValueError: .*; what is done is kept"):
         list(_realisations.realisations(run, jobs))
     with pytest.raises(InputError, match="1 of 1 parts failed"):
         list(_realisations.realisations(run, jobs))
-    assert len(made) == 4 and len(_cluster.files_in(tmp_path)) == 2
+    assert len(MADE) == 4 and len(_cluster.files_in(tmp_path)) == 2
+
+
+def of_its_place(run):
+    """A realisation whose settings are others at a worker, as those of another version are."""
+    return realisation(run, 4, f"for {run.scheduler}")
+
+
+def test_workers_of_another_version_are_told(workers, tmp_path):
+    """What is brought and is no result of these settings is one sentence; nothing is made here in its stead."""
+    with pytest.raises(InputError, match="other settings; start them in a checkout of this version"):
+        list(_realisations.realisations(Run(tmp_path, scheduler="tcp://HOST:8786"), [of_its_place]))
+    assert len(MADE) == 1 and tmp_path not in MADE
+
+
+def test_a_part_is_imported_as_its_experiment_is(tmp_path, monkeypatch):
+    """Constants of a module are single at a worker, though parts before it have turned to double precision."""
+    (tmp_path / "singular.py").write_text(
+        "import jax.numpy as jnp\n\nTENTH = jnp.asarray(0.1)\n\n\n"
+        "def told(run):\n    return str(TENTH.dtype), str(jnp.asarray(0.1).dtype)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    part = pickle.dumps(importlib.import_module("singular").told)
+    monkeypatch.delitem(sys.modules, "singular")
+    assert _cluster.apart(part, Run(tmp_path), {})[0] == ("float32", "float64")
 
 
 def test_a_file_sent_back_lies_in_its_folder(tmp_path):
