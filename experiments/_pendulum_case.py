@@ -1,7 +1,7 @@
 """The pendulums of sections 3.3.1 and 3.3.2: truth, recordings, the linear model, its posterior and its predictions."""
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from symplearn._sample import sample
 from symplearn._tempered_smc import TemperedSMC
 
 from ._command import Run
-from ._realisations import kept
+from ._realisations import kept, realisations
 
 GRAVITY, READ_UNTIL, HORIZON = 9.81, 4.0, 8.0
 # The released code's: 0.1 |A|_1 in nats, and half-normal variances (specification 5.3).
@@ -158,14 +158,20 @@ def each_block(
     run: Run, cells: list[Cell], datasets: int, size: int, settings: str, one: Callable[[Cell, int], dict[str, Any]]
 ) -> dict[Cell, list[dict[str, Any]]]:
     """What `one` finds of every data set of every cell; blocks of data sets are kept, and a block of every cell is
-    done before the next."""
+    done before the next. `one` can be pickled where `run` has a scheduler."""
     found: dict[Cell, list[dict[str, Any]]] = {cell: [] for cell in cells}
     todo = [(block, cell) for block in range(datasets // size) for cell in cells]
-    for block, cell in run.each(f"blocks of {size} data sets", todo):
-        rows = range(block * size, (block + 1) * size)
-
-        def make(cell: Cell = cell, rows: range = rows) -> dict[str, Any]:
-            return {"datasets": [one(cell, k) for k in rows]}
-
-        found[cell] += kept(run, cell.name, block, f"{settings}, {size} data sets", make)["datasets"]
+    words = f"{settings}, {size} data sets"
+    jobs = [partial(_block, cell=cell, number=block, size=size, settings=words, one=one) for block, cell in todo]
+    made = realisations(run, jobs, threads=1)
+    for (_, cell), block in zip(run.each(f"blocks of {size} data sets", todo), made, strict=True):
+        found[cell] += block["datasets"]
     return found
+
+
+def _block(
+    run: Run, cell: Cell, number: int, size: int, settings: str, one: Callable[[Cell, int], dict[str, Any]]
+) -> dict[str, Any]:
+    """A block of data sets of a cell, from its file if there is one."""
+    rows = range(number * size, (number + 1) * size)
+    return kept(run, cell.name, number, settings, lambda: {"datasets": [one(cell, k) for k in rows]})

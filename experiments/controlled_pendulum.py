@@ -1,6 +1,6 @@
 """Section 3.3.3: a damped pendulum with random inputs, learnt by the marginal likelihood and by LS + ERA.
 
-    python -m experiments.controlled_pendulum [--quick] [--out DIR] [--seed N]
+    python -m experiments.controlled_pendulum [--quick] [--out DIR] [--seed N] [--scheduler ADDRESS]
 
 A grid of data intervals and noise ratios, up to a hundred data sets in each cell (specification 5.7). The maximum a
 posteriori of (3.21) stands against least-squares Markov parameters with the eigensystem realisation algorithm, both
@@ -10,10 +10,13 @@ the average of LS + ERA leaves its worst data set out and that of the MAP keeps 
 
 For the data set of the noisy cell on which the published LS + ERA does best the posterior is drawn by three samplers:
 Algorithm 3 in one block and in its three, and importance sampling; and, to be looked at, in the coordinates of
-Fig. 2.2, which leave one direction free. Each cell leaves a file, and a run that was stopped goes on where it was.
+Fig. 2.2, which leave one direction free. Each cell leaves a file, and a run that was stopped goes on where it was. With
+`--scheduler` the cells are done by the workers, and the posterior here.
 """
 
+import importlib
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,7 +27,7 @@ from ._controlled_pendulum_estimates import FIRST, LAGS, LAST, ls_era, maxima
 from ._controlled_pendulum_figures import View, contours, details, marginals, spreads
 from ._controlled_pendulum_posterior import drawn, sampler_names
 from ._controlled_pendulum_results import DETAILED, NOISY, metrics, report
-from ._realisations import kept
+from ._realisations import kept, realisations
 
 # Data intervals, noise ratios and data sets of a cell.
 QUICK = ((0.1, 0.3, 0.5), (0.0, 0.1, 0.2), 20)
@@ -79,9 +82,8 @@ def experiment(run: Run) -> None:
     """Every cell, the posterior of one data set, the metrics, the table and the figures."""
     spacings, ratios, count = QUICK if run.quick else FULL
     grid = [(spacing, ratio) for spacing in spacings for ratio in ratios]
-    cells = {}
-    for number, (spacing, ratio) in run.each("cells", list(enumerate(grid))):
-        cells[spacing, ratio] = realisation(run, number, spacing, ratio, count)
+    jobs = [partial(realisation, number=k, spacing=s, ratio=r, count=count) for k, (s, r) in enumerate(grid)]
+    cells = dict(zip(run.each("cells", grid), realisations(run, jobs, threads=1), strict=True))
     draws = posterior(run, cells[NOISY])
     found = metrics(cells, draws)
     run.write(found)
@@ -110,8 +112,10 @@ def _view(run: Run, one: dict[str, Any], place: tuple[float, float], draws: dict
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    command("controlled_pendulum", "Section 3.3.3: a pendulum with inputs, by MAP and LS + ERA.", experiment, arguments)
+    about = "Section 3.3.3: a pendulum with inputs, by MAP and LS + ERA."
+    command("controlled_pendulum", about, experiment, arguments, sweep=True)
 
 
 if __name__ == "__main__":
-    main()
+    # Under its own name, by which the workers of a cluster find it.
+    importlib.import_module("experiments.controlled_pendulum").main()

@@ -1,6 +1,6 @@
 """Section 3.3.1: the linear pendulum by a linear model, against dynamic mode decomposition.
 
-    python -m experiments.linear_pendulum [--quick] [--out DIR] [--seed N]
+    python -m experiments.linear_pendulum [--quick] [--out DIR] [--seed N] [--scheduler ADDRESS]
 
 Five hundred data sets for each number of readings in 4 s and each noise (specification 5.3); both states are read, the
 start is known. A has four free entries, and both noises one variance each; `learn` starts at DMD's A and residuals, and
@@ -12,7 +12,9 @@ Each block of fifty data sets leaves a file, and a run that was stopped goes on 
 seventy minutes of one core, by an estimate from a tenth of it.
 """
 
+import importlib
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -47,6 +49,12 @@ FULL_CELLS = [Cell(n, sigma) for n in NUMBERS for sigma in NOISES]
 QUICK_CELLS = [Cell(n, sigma) for n in (8, 24, 40) for sigma in (0.01, 0.1)]
 FULL, QUICK, BLOCK = 500, 20, {False: 50, True: 20}
 SETTINGS = f"begun at DMD and its residuals, {SAMPLER}, {FALLBACK}, predicted to {HORIZON:g} s"
+
+
+def numbered(seed: int, cell: Cell, k: int) -> dict[str, Any]:
+    """Data set k of a cell, its noise and its draws from the seed."""
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), k), cell.n)
+    return dataset(cell, recording(LINEAR, cell, seed, k), key, k == 0 and cell in DETAILED)
 
 
 def dataset(cell: Cell, series: TimeSeries, key: PRNGKeyArray, shown: bool) -> dict[str, Any]:
@@ -90,12 +98,7 @@ def judged(cell: Cell, draws: np.ndarray, values: dict[str, np.ndarray]) -> dict
 def experiment(run: Run) -> None:
     """Every data set of every cell, the metrics, the tables and the figures."""
     cells, datasets = (QUICK_CELLS, QUICK) if run.quick else (FULL_CELLS, FULL)
-
-    def one(cell: Cell, k: int) -> dict[str, Any]:
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(run.seed), k), cell.n)
-        return dataset(cell, recording(LINEAR, cell, run.seed, k), key, k == 0 and cell in DETAILED)
-
-    results = each_block(run, cells, datasets, BLOCK[run.quick], SETTINGS, one)
+    results = each_block(run, cells, datasets, BLOCK[run.quick], SETTINGS, partial(numbered, run.seed))
     found = metrics(results, DETAILED)
     run.write(found)
     _draw(run, found, results)
@@ -113,8 +116,9 @@ def _draw(run: Run, found: dict[str, Any], results: dict[Cell, list[dict[str, An
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    command("linear_pendulum", "Section 3.3.1: a linear pendulum, against DMD.", experiment, arguments)
+    command("linear_pendulum", "Section 3.3.1: a linear pendulum, against DMD.", experiment, arguments, sweep=True)
 
 
 if __name__ == "__main__":
-    main()
+    # Under its own name, by which the workers of a cluster find it.
+    importlib.import_module("experiments.linear_pendulum").main()

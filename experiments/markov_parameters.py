@@ -1,6 +1,6 @@
 """Section 3.2.2.1: Markov parameters by least squares, weighted or not, and by the marginal likelihood.
 
-    python -m experiments.markov_parameters [--quick] [--out DIR] [--seed N]
+    python -m experiments.markov_parameters [--quick] [--out DIR] [--seed N] [--scheduler ADDRESS]
 
 Random systems with A = I, of two sizes (specification 5.5), are recorded once; 18 Markov parameters come from the first
 K equations by LS (3.13), by GLS with the true weights (3.15), and by the MAP of a linear model. The error is the
@@ -12,7 +12,9 @@ those the MAP is found in LARGE_MAP repeats, for the least noise and up to 1000 
 files, and a run that was stopped goes on where it was.
 """
 
+import importlib
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +24,7 @@ from ._markov_parameters_case import NOISES, SIZES, case, floor, spectral_error
 from ._markov_parameters_estimates import FIRST, LAST, PAST, autoregression, gls, ls, maxima, parameters_of
 from ._markov_parameters_figures import errors_against_equations
 from ._markov_parameters_results import metrics, report
-from ._realisations import kept
+from ._realisations import kept, realisations
 
 # Numbers of equations K for each size. The least are d_u times the lag, where least squares is determined at all.
 QUICK = {"small": (154, 500, 1000)}
@@ -84,10 +86,12 @@ def experiment(run: Run) -> None:
     for size in QUICK if run.quick else FULL:
         repeats = QUICK_REPEATS if run.quick else REPEATS[size]
         groups = [range(first, min(first + GROUP, repeats)) for first in range(0, repeats, GROUP)]
-        todo += [(size, noise, number, one) for noise in NOISES for number, one in enumerate(groups)]
+        todo += [(size, noise, k, one) for noise in NOISES for k, one in enumerate(groups)]
+    jobs = [partial(realisation, size=size, noise=noise, number=k, repeats=one) for size, noise, k, one in todo]
+    made = realisations(run, jobs, threads=1)
     results: dict[tuple[str, float], list[dict[str, Any]]] = {}
-    for size, noise, number, repeats in run.each("groups of repeats", todo):
-        results.setdefault((size, noise), []).append(realisation(run, size, noise, number, repeats))
+    for (size, noise, *_), group_found in zip(run.each("groups of repeats", todo), made, strict=True):
+        results.setdefault((size, noise), []).append(group_found)
     found = metrics(results)
     run.write(found)
     for size in SIZES:
@@ -98,8 +102,9 @@ def experiment(run: Run) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    command("markov_parameters", "Section 3.2.2.1: Markov parameters by LS, GLS and MAP.", experiment, arguments)
+    command("markov_parameters", "Section 3.2.2.1: Markov parameters by LS, GLS and MAP.", experiment, arguments, True)
 
 
 if __name__ == "__main__":
-    main()
+    # Under its own name, by which the workers of a cluster find it.
+    importlib.import_module("experiments.markov_parameters").main()

@@ -1,6 +1,6 @@
 """Section 3.3.2: the nonlinear pendulum by a linear model, and whether its noises have two modes.
 
-    python -m experiments.nonlinear_pendulum [--quick] [--out DIR] [--seed N]
+    python -m experiments.nonlinear_pendulum [--quick] [--out DIR] [--seed N] [--scheduler ADDRESS]
 
 Cells and settings of specification 5.4: 24 readings in 4 s with noise 0.1 and 1, and 26 with 0.1; `learn` and `sample`
 as in `linear_pendulum`. Estimates: the posterior predictive mean (2.19), the MAP, and the most probable model of the
@@ -16,7 +16,9 @@ Blocks of data sets leave files, and a run that was stopped goes on where it was
 thirty minutes of one core, by an estimate from a twentieth of it.
 """
 
+import importlib
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -65,6 +67,12 @@ def settings(quick: bool) -> str:
         f"{LAID_OUT[quick]} and {UNKNOWN_START[quick]} landscapes of {noise.GRID.size} points, chains of {LENGTH}"
     )
     return f"begun at DMD and its residuals, {SAMPLER}, {FALLBACK}, predicted to {HORIZON:g} s, {laid_out}"
+
+
+def numbered(seed: int, quick: bool, cell: Cell, k: int) -> dict[str, Any]:
+    """Data set k of a cell, its noise and its draws from the seed."""
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), k), cell.n)
+    return dataset(cell, recording(NONLINEAR, cell, seed, k), key, k, quick)
 
 
 def dataset(cell: Cell, series: TimeSeries, key: PRNGKeyArray, k: int, quick: bool) -> dict[str, Any]:
@@ -156,12 +164,7 @@ def judged(cell: Cell, draws: np.ndarray, values: dict[str, np.ndarray]) -> dict
 
 def experiment(run: Run) -> None:
     """Every data set of every cell, the metrics, the tables and the figures."""
-
-    def one(cell: Cell, k: int) -> dict[str, Any]:
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(run.seed), k), cell.n)
-        return dataset(cell, recording(NONLINEAR, cell, run.seed, k), key, k, run.quick)
-
-    datasets = QUICK if run.quick else FULL
+    datasets, one = QUICK if run.quick else FULL, partial(numbered, run.seed, run.quick)
     results = each_block(run, list(CELLS), datasets, BLOCK[run.quick], settings(run.quick), one)
     found = metrics(results)
     run.write(found)
@@ -183,8 +186,9 @@ def _draw(run: Run, results: dict[Cell, list[dict[str, Any]]]) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    command("nonlinear_pendulum", "Section 3.3.2: a nonlinear pendulum by a linear model.", experiment, arguments)
+    command("nonlinear_pendulum", "Section 3.3.2: a nonlinear pendulum by a linear model.", experiment, arguments, True)
 
 
 if __name__ == "__main__":
-    main()
+    # Under its own name, by which the workers of a cluster find it.
+    importlib.import_module("experiments.nonlinear_pendulum").main()

@@ -1,6 +1,6 @@
 """Which sampler for which posterior, by measurement: the dissertation's four posteriors, every sampler, one run.
 
-    python -m experiments.samplers [--quick] [--out DIR] [--seed N]
+    python -m experiments.samplers [--quick] [--out DIR] [--seed N] [--scheduler ADDRESS]
 
 The posteriors are those of the linear pendulum (specification 5.3), of a linear model of the nonlinear pendulum (5.4),
 of Henon-Heiles (5.15) and of Cherry's problem (5.16, one recording). `learn` finds each maximum; `compare_samplers`
@@ -10,9 +10,11 @@ draws can be trusted, the most effective draws a second. Keys are MEASURE_POSTER
 `off_by`, how far the means are from those of all that are trusted, in standard deviations. A quick run leaves out the
 slow samplers, and says so.
 
-A file is left for each posterior, and a run that was stopped goes on where it was.
+A file is left for each posterior, and a run that was stopped goes on where it was. With `--scheduler` the seconds are
+those of the worker's machine, one for each posterior.
 """
 
+import importlib
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -36,7 +38,7 @@ from symplearn._variational import VariationalInference
 
 from ._command import Run, command, print_table
 from ._noise_zoo import ZOO
-from ._realisations import kept
+from ._realisations import kept, realisations
 
 POSTERIORS = ("linear_pendulum", "nonlinear_pendulum", "henon_heiles", "cherry")
 FAST: tuple[AbstractSampler, ...] = (AdaptiveImportance(), RandomWalk(steps=4000))
@@ -63,6 +65,13 @@ def compared(run: Run, name: str) -> dict[str, Any]:
     estimate = learn(begin, problem.recording(run.seed, 0), prior=problem.prior, key=key)
     comparison = compare_samplers(estimate, samplers(run), key=key)
     return {"table": str(comparison), "trials": _trials(comparison), "choice": _choice(comparison)}
+
+
+def posterior(run: Run, name: str) -> dict[str, Any]:
+    """One posterior's comparison, from its file if there is one."""
+    words = eqx.tree_pformat(samplers(run), width=1000)
+    prior = eqx.tree_pformat(ZOO[name].prior, short_arrays=False, width=1000)
+    return kept(run, name, 0, f"{words}, {prior}", partial(compared, run, name))
 
 
 def _trials(comparison: Comparison) -> dict[str, dict[str, float]]:
@@ -129,10 +138,9 @@ def report(results: dict[str, dict[str, Any]], quick: bool) -> None:
 
 def experiment(run: Run) -> None:
     """Every posterior, the metrics, the figure and the tables."""
-    words, results = eqx.tree_pformat(samplers(run), width=1000), {}
-    for name in run.each("posteriors", POSTERIORS):
-        prior = eqx.tree_pformat(ZOO[name].prior, short_arrays=False, width=1000)
-        results[name] = kept(run, name, 0, f"{words}, {prior}", partial(compared, run, name))
+    # One at a time, for each is timed.
+    made = realisations(run, [partial(posterior, name=name) for name in POSTERIORS], threads=1)
+    results = dict(zip(run.each("posteriors", POSTERIORS), made, strict=True))
     run.write(metrics(results))
     run.save(figure(results), "samplers.png")
     report(results, run.quick)
@@ -140,8 +148,9 @@ def experiment(run: Run) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    command("samplers", "Every sampler on the dissertation's four posteriors.", experiment, arguments)
+    command("samplers", "Every sampler on the dissertation's four posteriors.", experiment, arguments, sweep=True)
 
 
 if __name__ == "__main__":
-    main()
+    # Under its own name, by which the workers of a cluster find it.
+    importlib.import_module("experiments.samplers").main()

@@ -15,12 +15,14 @@ from symplearn._places import Here, Outcome
 sys.path.insert(0, str(ROOT))  # experiments are no installed package
 _cluster = importlib.import_module("experiments._cluster")
 _concealed_run = importlib.import_module("experiments._concealed_run")
+_pendulum_case = importlib.import_module("experiments._pendulum_case")
 _realisations = importlib.import_module("experiments._realisations")
 Run = importlib.import_module("experiments._command").Run
 tao = importlib.import_module("experiments.tao")
 
 SWEEPS = (
-    "calibration", "cherry", "concealed", "henon_heiles", "noise_starts", "tao",
+    "calibration", "cherry", "concealed", "controlled_pendulum", "henon_heiles", "linear_pendulum",
+    "markov_parameters", "noise_starts", "nonlinear_pendulum", "samplers", "tao",
 )  # fmt: skip
 MADE = []
 
@@ -64,6 +66,25 @@ def test_what_fails_is_told_and_the_rest_is_kept(workers, tmp_path):
     with pytest.raises(InputError, match="1 of 1 parts failed"):
         list(_realisations.realisations(run, jobs))
     assert len(MADE) == 4 and len(_cluster.files_in(tmp_path)) == 2
+
+
+def numbered(seed, cell, k):
+    """A data set, made up."""
+    MADE.append((cell.n, k))
+    return {"k": k, "seed": seed}
+
+
+def test_blocks_are_kept_as_here_and_made_once(workers, tmp_path):
+    """Every block of data sets of a cell is a part, and leaves the file of here; a second run makes none."""
+    cells, there, here = [_pendulum_case.Cell(n, 0.1) for n in (8, 9)], *(Run(tmp_path / name) for name in "th")
+    blocks = partial(_pendulum_case.each_block, cells=cells, datasets=4, size=2, settings="so")
+    here.out.mkdir()
+    found = blocks(here, one=partial(numbered, 5))
+    assert [one["k"] for one in found[cells[1]]] == [0, 1, 2, 3]
+    there = there._replace(scheduler="tcp://HOST:8786")
+    assert blocks(there, one=partial(numbered, 5)) == found == blocks(there, one=partial(numbered, 5))
+    assert MADE[8:] == MADE[:8] and len(_cluster.files_in(there.out)) == 4
+    assert _cluster.files_in(there.out) == _cluster.files_in(here.out)
 
 
 def of_its_place(run):
