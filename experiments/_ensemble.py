@@ -69,13 +69,22 @@ class Ensemble(NamedTuple):
 
     def run(self, what: str, path: Path, deadline: "Deadline") -> Any | None:
         """The best models, or None where the time was up; `path` then holds where it stopped."""
-        state = _begin(self)
-        words = f"{what} {self.epochs} {self.training}"
-        file = Checkpoint(path, seal_of((self.models, self.recordings, self.keys), words))
+        file = self._file(what, path)
         state = run_epochs(
-            lambda state, count: _advance(self, state, count), state, file, lambda: deadline.moment, what
+            lambda state, count: _advance(self, state, count), _begin(self), file, lambda: deadline.moment, what
         )
-        return _best(self, state) if bool(np.all(state.epoch == self.epochs)) else None
+        return _best(self, state) if self._is_over(state) else None
+
+    def is_done(self, what: str, path: Path) -> bool:
+        """Whether `path` holds the end of the training."""
+        return path.exists() and self._is_over(self._file(what, path).load(_begin(self)))
+
+    def _file(self, what: str, path: Path) -> Checkpoint:
+        words = f"{what} {self.epochs} {self.training}"
+        return Checkpoint(path, seal_of((self.models, self.recordings, self.keys), words))
+
+    def _is_over(self, state: TrainingState) -> bool:
+        return bool(np.all(state.epoch == self.epochs))
 
 
 @eqx.filter_jit

@@ -1,17 +1,20 @@
 """A network learns the Hamiltonian of the double pendulum by likelihood and by L1. Dissertation 5.4.4, Figs 5.12-5.14.
 
     python -m experiments.double_pendulum [--quick] [--out DIR] [--seed N] [--minutes M]
-                                          [--width W] [--epochs E] [--repeats R]
+                                          [--width W] [--epochs E] [--repeats R] [--scheduler ADDRESS]
 
 Masses and lengths 1, 2000 readings every 0.01 with noise v ~ U[0.99, 1.01] times each. From q1 = 1, as printed, the
 motion is regular (specification E48), from q1 = 2 chaotic. Both, and all repeats, are one program; `--minutes` stops it
-in time, and the same command goes on from there. Truth by SciPy's DOP853.
+in time, and the same command goes on from there. With `--scheduler` the workers of a Dask cluster train, one way each.
+Truth by SciPy's DOP853.
 
 Beyond the dissertation: a learning step 5 times larger, on every fifth reading; and pieces of the recording filtered
 side by side, each given its first reading, a few at a time: many steps of Adam for the price of one.
 """
 
+import importlib
 import math
+import time
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -36,6 +39,7 @@ from symplearn._prior import Flat, HalfNormal, Prior
 from symplearn._train import Training
 
 from . import _double_pendulum_results as found
+from ._cluster import elsewhere
 from ._command import Run
 from ._double_pendulum_results import COARSE, GRAVITY, L1, POSTERIOR, STEP, WAYS
 from ._ensemble import Deadline, Ensemble, plain, side_by_side, smaller, study_command
@@ -139,22 +143,52 @@ def training_of(settings: Settings, way: str) -> Training:
     return Training(pieces, prior, both, math.ceil(intervals / size))
 
 
+def ensemble(settings: Settings, way: str, seed: int) -> Ensemble:
+    """The trainings of one way."""
+    series, rows = recordings(settings, seed), 2 * settings.repeats
+    keys = jax.random.split(jax.random.key(seed), rows)
+    starts = jnp.repeat(jnp.asarray(list(STARTS.values())), settings.repeats, axis=0)
+    models = _models(keys, starts, settings.width, way != L1)
+    kept = TimeSeries(series.times[:, ::SPARSE], series.readings[:, ::SPARSE]) if way == COARSE else series
+    return Ensemble(training_of(settings, way), models, kept, keys, settings.epochs)
+
+
 def study(settings: Settings, run: Run, deadline: Deadline) -> dict[str, Any]:
     """The best models of each way that is done by the deadline."""
     folder = run.out / "parts"
     folder.mkdir(exist_ok=True)
-    series, rows = recordings(settings, run.seed), 2 * settings.repeats
-    keys = jax.random.split(jax.random.key(run.seed), rows)
-    starts = jnp.repeat(jnp.asarray(list(STARTS.values())), settings.repeats, axis=0)
-
-    def best(way: str) -> Any | None:
-        models = _models(keys, starts, settings.width, way != L1)
-        kept = TimeSeries(series.times[:, ::SPARSE], series.readings[:, ::SPARSE]) if way == COARSE else series
-        ensemble = Ensemble(training_of(settings, way), models, kept, keys, settings.epochs)
-        return ensemble.run(way, folder / f"{way}.npz", deadline)
-
-    found = side_by_side([partial(best, way) for way in WAYS], deadline)
+    ensembles = {way: ensemble(settings, way, run.seed) for way in WAYS}
+    if run.scheduler is not None:
+        _on_cluster(settings, ensembles, run, deadline)
+        deadline = Deadline(-math.inf)  # what is done is read here, and nothing trained
+    jobs = [partial(one.run, way, folder / f"{way}.npz", deadline) for way, one in ensembles.items()]
+    found = side_by_side(jobs, deadline)
     return {way: models for way, models in zip(WAYS, found, strict=True) if models is not None}
+
+
+def _on_cluster(settings: Settings, ensembles: dict[str, Ensemble], run: Run, deadline: Deadline) -> None:
+    """Every way that is not done is a part of its own; what it has begun goes along and comes back."""
+    until, files = time.time() + deadline.left(), {way: run.out / "parts" / f"{way}.npz" for way in WAYS}
+    ways = [way for way in WAYS if not ensembles[way].is_done(way, files[way])]
+    sent = [{f"parts/{way}.npz": files[way].read_bytes()} if files[way].exists() else {} for way in ways]
+    parts = [partial(_part, settings, way, _numbers(ensembles[way]), until) for way in ways]
+    for _ in elsewhere(run, parts, sent):
+        pass
+
+
+def _numbers(of: Ensemble) -> list[np.ndarray]:
+    return [np.asarray(leaf) for leaf in jax.tree.leaves((of.models, of.recordings))]
+
+
+def _part(settings: Settings, way: str, numbers: Sequence[np.ndarray], until: float, run: Run) -> None:
+    """Train one way on these numbers, until a moment of `time.time` at most."""
+    folder, own = run.out / "parts", ensemble(settings, way, run.seed)
+    folder.mkdir(exist_ok=True)
+    # The file is sealed with its numbers, and another processor's own may differ in the last digit.
+    structure = jax.tree.structure((own.models, own.recordings))
+    models, series = jax.tree.unflatten(structure, [jnp.asarray(each) for each in numbers])
+    moment = time.monotonic() + until - time.time()
+    own._replace(models=models, recordings=series).run(way, folder / f"{way}.npz", Deadline(moment))
 
 
 @eqx.filter_jit
@@ -242,8 +276,11 @@ def experiment(settings: Settings, deadline: Deadline, run: Run) -> None:
 def main(arguments: Sequence[str] | None = None, settings: Settings | None = None) -> None:
     """The command line; `settings` are others than those of the options."""
     about = "Learn the double pendulum by likelihood and by L1."
-    study_command("double_pendulum", about, experiment, lambda quick: settings or (QUICK if quick else FULL), arguments)
+    study_command(
+        "double_pendulum", about, experiment, lambda quick: settings or (QUICK if quick else FULL), arguments, True
+    )
 
 
 if __name__ == "__main__":
-    main()
+    # Under its own name, by which the workers of a cluster find it.
+    importlib.import_module("experiments.double_pendulum").main()

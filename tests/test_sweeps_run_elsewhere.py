@@ -6,6 +6,7 @@ import pickle
 import sys
 from functools import partial
 
+import equinox as eqx
 import pytest
 from command_line_cases import ROOT
 
@@ -15,13 +16,15 @@ from symplearn._places import Here, Outcome
 sys.path.insert(0, str(ROOT))  # experiments are no installed package
 _cluster = importlib.import_module("experiments._cluster")
 _concealed_run = importlib.import_module("experiments._concealed_run")
+_ensemble = importlib.import_module("experiments._ensemble")
 _pendulum_case = importlib.import_module("experiments._pendulum_case")
 _realisations = importlib.import_module("experiments._realisations")
 Run = importlib.import_module("experiments._command").Run
+double_pendulum = importlib.import_module("experiments.double_pendulum")
 tao = importlib.import_module("experiments.tao")
 
 SWEEPS = (
-    "calibration", "cherry", "concealed", "controlled_pendulum", "henon_heiles", "linear_pendulum",
+    "calibration", "cherry", "concealed", "controlled_pendulum", "double_pendulum", "henon_heiles", "linear_pendulum",
     "markov_parameters", "noise_starts", "nonlinear_pendulum", "samplers", "tao",
 )  # fmt: skip
 MADE = []
@@ -170,6 +173,44 @@ def test_a_training_goes_on_from_what_was_begun(workers, tmp_path, monkeypatch):
     assert sorted(_cluster.files_in(tmp_path)) == ["parts/n_300.npz", "parts/n_400.npz"]
     tao.study(settings, run, tao.Deadline())
     assert len(told) == 4
+
+
+class OneBlock(_ensemble.Deadline):
+    """Comes after one block of a training, unless it is over already."""
+
+    @property
+    def moment(self):
+        self.blocks -= 1
+        return math.inf if self.blocks >= 0 else -math.inf
+
+    @moment.setter
+    def moment(self, value):
+        self.blocks = int(value > -math.inf)
+
+
+def test_ways_go_on_from_what_was_begun(workers, tmp_path, monkeypatch):
+    """Every way is a part; what is begun goes with it until it is done, and is then the file of here, and read here."""
+    settings = double_pendulum.Settings(readings=11, repeats=1, width=2, epochs=20, piece=2, batch=4)
+    there, here, begun = *(Run(tmp_path / name) for name in "th"), []
+    study, done = partial(double_pendulum.study, settings), dict.fromkeys(double_pendulum.WAYS, "trained")
+
+    def advance(ensemble, state, count):
+        begun.append(int(state.epoch.max()))
+        return eqx.tree_at(lambda state: state.epoch, state, state.epoch + count)
+
+    monkeypatch.setattr(_ensemble, "_advance", advance)
+    monkeypatch.setattr(_ensemble, "_best", lambda ensemble, state: "trained")
+    for run in (there, here):
+        run.out.mkdir()
+    there = there._replace(scheduler="tcp://HOST:8786")
+    with monkeypatch.context() as brief:
+        brief.setattr(double_pendulum, "Deadline", OneBlock)
+        assert study(there, _ensemble.Deadline()) == {} and begun == 4 * [0]
+    assert study(there, _ensemble.Deadline()) == done and begun.count(0) == begun.count(1) == 4
+    count = len(begun)
+    assert study(there, _ensemble.Deadline()) == done and len(begun) == count
+    assert study(here, _ensemble.Deadline()) == done and begun.count(0) == 8
+    assert _cluster.files_in(there.out) == _cluster.files_in(here.out)
 
 
 @pytest.mark.parametrize("name", SWEEPS)
