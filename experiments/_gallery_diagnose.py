@@ -1,6 +1,6 @@
 """One diagnosis in a process of its own, as `symplearn diagnose` makes it, with the series behind its pictures.
 
-    python -m experiments._gallery_diagnose SIMULATION RECORDING ... --out DIR [--holdout FRACTION]
+    python -m experiments._gallery_diagnose SIMULATION RECORDING ... --out DIR [--holdout FRACTION] [--jobs THREADS]
 
 Leaves what the command leaves, and `series.npz`: every array of recording k under `k/NAME`.
 """
@@ -29,6 +29,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--holdout", type=float, default=0.25)
     parser.add_argument("--time-limit", type=float, default=float("inf"))
+    parser.add_argument("--jobs", type=int, default=Options.jobs)
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
@@ -36,7 +37,7 @@ def main() -> int:
     try:
         file = read_simulation(given.simulation)
         read = read_recordings(file, given.recordings)
-        options = Options(holdout=given.holdout, time_limit=given.time_limit, progress=_Progress().say)
+        options = Options(given.holdout, jobs=given.jobs, time_limit=given.time_limit, progress=_Progress().say)
         found = diagnose(file, read, options)
     except InputError as error:
         print(error, file=sys.stderr)

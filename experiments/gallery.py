@@ -1,24 +1,28 @@
 """The gallery: a page for every real recording, with what is known, what was found, and before and after.
 
     python -m experiments.gallery [NAME ...] [--out DIR] [--recordings FOLDER] [--kept DIR] [--any-version]
+                                  [--scheduler ADDRESS]
 
 The recordings are read where they lie ($SYMPLEARN_RECORDINGS, or ../shared/recordings beside the checkout). Results are
 kept by recording, so that a run that was stopped goes on; they are made anew when a recording, its simulation or the
-program has changed.
+program has changed. With `--scheduler` the workers of a Dask cluster diagnose, a core each, and the pages are written
+here.
 """
 
 import argparse
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from symplearn._errors import InputError, nearest, printable
+from symplearn._places import place
 
+from ._command import SCHEDULER
 from ._gallery_page_file import Page, read_page
 from ._gallery_pages import index_rows, write_index, write_page
-from ._gallery_results import ROOT, Result, Source, result
+from ._gallery_results import ROOT, Result, Source, made_at, result
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -27,8 +31,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         names = _names(given.recordings, given.names)
         source = Source(given.recordings, given.kept, given.any_version)
+        failures = None if given.scheduler is None else _elsewhere(names, source, given.scheduler)
         given.out.mkdir(parents=True, exist_ok=True)
-        failed = [name for name in names if not _page(name, source, given.out)]
+        failed = [name for name in names if not _page(name, source, given.out, failures)]
     except (InputError, OSError) as error:
         print(f"experiments.gallery: {printable(str(error))}", file=sys.stderr)
         return 2
@@ -47,6 +52,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--recordings", type=Path, default=_recordings(), help="folder of the recordings")
     parser.add_argument("--kept", type=Path, default=ROOT / "out" / "gallery", help="folder of the kept results")
     parser.add_argument("--any-version", action="store_true", help="kept results of another version will do")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help=SCHEDULER)
     return parser
 
 
@@ -65,10 +71,20 @@ def _names(folder: Path, wanted: Sequence[str]) -> list[str]:
     return list(wanted) or known
 
 
-def _page(name: str, source: Source, out: Path) -> bool:
+def _elsewhere(names: Sequence[str], source: Source, scheduler: str) -> dict[Path, str]:
+    """Every diagnosis that is not kept, by the workers; how some failed."""
+    with place(scheduler, _tell) as workers:
+        return made_at(workers, [read_page(name, source.recordings) for name in names], source, _tell)
+
+
+def _tell(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def _page(name: str, source: Source, out: Path, failures: Mapping[Path, str] | None) -> bool:
     """Diagnose, write the page and its line of the index. Whether every diagnosis went through."""
     page = read_page(name, source.recordings)
-    results = list(_results(page, source))
+    results = list(_results(page, source, failures))
     facts = write_page(page, results, out, source)
     write_index(index_rows(page, results, facts), out)
     for _, fact in facts:
@@ -76,13 +92,13 @@ def _page(name: str, source: Source, out: Path) -> bool:
     return not any(one.failure for one in results)
 
 
-def _results(page: Page, source: Source) -> list[Result]:
+def _results(page: Page, source: Source, failures: Mapping[Path, str] | None) -> list[Result]:
     made = []
     for case in page.cases:
         begin = time.monotonic()
-        print(f"{page.name}: {case.label or case.name}", file=sys.stderr, flush=True)
-        made.append(result(page, case, source))
-        print(f"  done after {time.monotonic() - begin:.0f} s", file=sys.stderr, flush=True)
+        _tell(f"{page.name}: {case.label or case.name}")
+        made.append(result(page, case, source, failures))
+        _tell(f"  done after {time.monotonic() - begin:.0f} s")
     return made
 
 

@@ -1,6 +1,7 @@
 """The gallery writes a page from a diagnosis alone, goes on where it was stopped, and says what falls short."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from experiments import _gallery_figures as figures
 from experiments import _gallery_page_file as page_file
 from experiments import _gallery_results as results
 from experiments import gallery
+from experiments._cluster import files_in
 from experiments._gallery_diagnose import write_series
 from experiments._gallery_known import compared
+from symplearn._places import Here
 
 NAME = "pendulum"
 PAGE = """
@@ -189,6 +192,30 @@ def test_failed_diagnosis_has_a_page(place, monkeypatch, capsys):
     assert NAME in capsys.readouterr().err
 
 
+def test_workers_make_what_is_not_kept(place, monkeypatch):
+    """Sent the files alone, they leave the results and the page of here; a second run asks them nothing."""
+    folder, made = place
+    make(folder)
+    found = {name: files_in(folder / name) for name in ("out", "kept")}
+    for name in found:
+        shutil.rmtree(folder / name)
+    monkeypatch.setattr(gallery, "place", lambda address, tell: Here())
+    for _ in range(2):
+        assert make(folder, "--scheduler=tcp://HOST:8786") == 0 and len(made) == 2
+        assert {name: files_in(folder / name) for name in found} == found
+    assert made[1][-2:] == ["--jobs", "1"] and not any(str(folder) in word for word in made[1])
+
+
+def test_what_failed_at_a_worker_is_not_made_here(place, monkeypatch):
+    """Its page says how, the exit code is 1, and the next run asks a worker again."""
+    folder, made = place
+    monkeypatch.setattr(gallery, "place", lambda address, tell: Here())
+    monkeypatch.setattr(results, "_run", lambda command: made.append(command) or "the fit fell over (exit code 1)")
+    for count in (1, 2):
+        assert make(folder, "--scheduler=tcp://HOST:8786") == 1 and len(made) == count
+        assert "The diagnosis failed: the fit fell over (exit code 1)." in (folder / "out" / f"{NAME}.md").read_text()
+
+
 def test_recording_that_nobody_wrote_about(place):
     """A folder without a page of its own gets a plain one, diagnosed where a simulation lies in it."""
     folder, made = place
@@ -226,6 +253,8 @@ def test_wrong_use_is_one_sentence(place, capsys):
     assert "no recordings lie in" in capsys.readouterr().err
     assert make(folder, "pendulun") == 2
     assert "`pendulum`" in capsys.readouterr().err
+    assert make(folder, "--scheduler=nonsense") == 2 and not (folder / "out").exists()
+    assert capsys.readouterr().err.startswith("experiments.gallery: --scheduler: `nonsense` is no address")
     with (folder / "pages" / NAME / "page.toml").open("a") as stream:
         stream.write("certain = true\n")
     assert make(folder) == 2
