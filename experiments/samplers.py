@@ -60,6 +60,8 @@ def samplers(run: Run) -> tuple[AbstractSampler, ...]:
 
 def compared(run: Run, name: str) -> dict[str, Any]:
     """The comparison on one posterior."""
+    # The programs of all samplers on all posteriors together would take more memory maps than a process may have.
+    jax.clear_caches()
     problem, key = ZOO[name], jax.random.key(run.seed)
     begin = problem.model(problem.process, problem.measurement)
     estimate = learn(begin, problem.recording(run.seed, 0), prior=problem.prior, key=key)
