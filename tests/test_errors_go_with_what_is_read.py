@@ -9,6 +9,7 @@ from scipy.stats import norm, t
 
 from symplearn import _effects as effects
 from symplearn.diagnosis._calibrate import calibrate
+from symplearn.diagnosis._clock import weigh_clock
 from symplearn.diagnosis._positional import _Channel, weigh_positional
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
@@ -31,8 +32,9 @@ def test_polynomials_are_integrated_out(ratio):
     np.testing.assert_allclose(columns[:4] @ one.cleared(ratio).T, gram, rtol=1e-9)
 
 
-def fitted(scale, errors=None, given=False):
-    """A spring, its stiffness calibrated, whose reading a sensor bends by `scale`, fitted, its noise `given` or not."""
+def fitted(scale, errors=None, given=0.0):
+    """A spring, its stiffness calibrated, whose reading a sensor bends by `scale`, fitted; its noise is `given`, and
+    said to be wrong, or not."""
     rates = lambda t, x: [x[1], -x[0] - 0.01 * x[1]]  # noqa: E731
     q = cases.solved(rates, [1.0, 0.0], TIMES)[:, 0]
     errors = np.random.default_rng(2).normal(size=len(q)) if errors is None else errors
@@ -40,7 +42,7 @@ def fitted(scale, errors=None, given=False):
     more = (
         '[parameters]\nk = { value = 1.0, sd = 0.1 }\n[[terms]]\neffect = "viscous_damping"\ntarget = "q"\nc = 0.01\n'
     )
-    more += f"[recording.noise]\ny = {NOISE}\n" if given else ""
+    more += f"[recording.noise]\ny = {given}\n" if given else ""
     p = cases.problem(cases.simulation("p**2/2 + k*q**2/2", more=more), [cases.recorded(TIMES, y)], 0.05)
     priors = replace(priors_without_effects(p), precision=np.full(p.size, 1e-2))
     begin = np.zeros(p.size)
@@ -91,20 +93,32 @@ def test_heavy_tails_speak_for_no_remainder():
     assert bent[2].log_evidence > bent[0].log_evidence + 20
 
 
-def test_a_noise_that_is_called_wrong_has_no_remainder_beside_it():
-    """Where every combination says that the noise is wrongly given, none is weighed under a coloured error or one that
-    goes with what is read, which would only blur it."""
-    p, fits, priors = fitted(0.0, given=True)
+def test_a_noise_that_is_called_wrong_has_no_rough_remainder_beside_it():
+    """Where every combination says that the noise is wrongly given, none is weighed under an error with a memory, which
+    would only blur it."""
+    p, fits, priors = fitted(0.0, given=NOISE)
     assert len(fits.z) == 1
-    assert weigh_coloured(p, fits, priors, [len(TIMES)]) == weigh_positional(p, fits, priors, [len(TIMES)]) == []
+    assert weigh_coloured(p, fits, priors, [len(TIMES)]) == weigh_clock(p, fits, priors, [len(TIMES)], []) == []
     assert len(weigh_white(p, fits, priors, [len(TIMES)])) == 1
+
+
+def test_a_noise_given_too_large_is_told_beside_a_bent_scale():
+    """Where the noise is two thirds of what is given and the scale is bent, that the noise is wrong is likelier with
+    the bend than without, and likelier than the bend alone; the noise told is the noise without the bend."""
+    p, fits, priors = fitted(0.03, given=1.5 * NOISE)
+    trusting = calibrate(Stepper(p), fits.z, [()], priors, [len(TIMES)])
+    (bent,), (straight,) = (weigh(p, fits, priors, [len(TIMES)]) for weigh in (weigh_positional, weigh_white))
+    (alone,) = weigh_positional(p, trusting, priors, [len(TIMES)])
+    assert bent.log_evidence > max(straight.log_evidence, alone.log_evidence) + 10
+    # An sd estimated from 400 readings has an error of 3.5 %: three of those.
+    assert bent.noise[0] == pytest.approx(NOISE, rel=0.1)
 
 
 @pytest.mark.parametrize("astray", [3.0, 1e3])
 def test_a_fit_that_went_astray_gains_nothing_by_heavy_tails(astray):
     """A trajectory far off the readings is no likelier under any remainder than one that follows them, though Student's
     t alone would be likelier by nearly all that it is off."""
-    p, fits, priors = fitted(0.0, given=True)
+    p, fits, priors = fitted(0.0, given=NOISE)
     combination = [()]
     near = calibrate(Stepper(p), fits.z[:1], combination, priors, [len(TIMES)])
     z = near.z.copy()

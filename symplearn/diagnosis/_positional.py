@@ -16,8 +16,8 @@ from numpy.polynomial.legendre import legvander
 from ._calibrate import Fits, Priors, residuals, weights
 from ._evidence import variance_inflation
 from ._problem import Problem
-from ._scatter import law_gain
-from ._weighed import REMAINDER, Estimate, correlated, trusting
+from ._scatter import factor_evidence, law_gain
+from ._weighed import REMAINDER, Estimate, correlated
 
 # Polynomials up to this degree, and variances of the error against the noise's that are tried.
 _DEGREE = 12
@@ -64,12 +64,13 @@ class _Channel:
 def weigh_positional(problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int]) -> list[Estimate]:
     """Estimates where each channel's error goes with what it reads, about the trajectory fit.
 
-    None for a combination with a wrongly given noise, which such an error would only blur.
+    Of a combination with a wrongly given noise, too: no such error is as rough as noise.
     """
     out = []
-    for b in trusting(problem, fits):
+    for b, combination in enumerate(fits.combinations):
+        known = problem.noise_of(combination)
         channels = [_channel(problem, fits, b, rows, j) for j in range(problem.channels)]
-        ratios, occam = zip(*(_ratio(problem, one, j) for j, one in enumerate(channels)), strict=True)
+        ratios, occam = zip(*(_ratio(problem, one, j, known[j]) for j, one in enumerate(channels)), strict=True)
         both = [one.marginal(ratio) for one, ratio in zip(channels, ratios, strict=True)]
         grams, logs = np.stack([gram for gram, _ in both]), np.array([log for _, log in both])
         number = np.array([one.number for one in channels])
@@ -95,9 +96,9 @@ def _channel(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int) 
     return _Channel(columns, 1 + problem.size, seen, float(2 * np.log(root[seen]).sum()))
 
 
-def _ratio(problem: Problem, one: _Channel, j: int) -> tuple[float, float]:
-    """The likeliest variance of the error against the noise's, and what its choice owes."""
-    known, values = problem.noise[j], []
+def _ratio(problem: Problem, one: _Channel, j: int, known: float) -> tuple[float, float]:
+    """The likeliest variance of the error against the noise's, which may be known, and what its choice owes."""
+    values = []
     spread = float(np.nanstd(np.concatenate([r.readings[:, j] for r in problem.rows])))
     bare = replace(one, columns=np.concatenate([one.columns[:1], one.columns[one.plain :]]), plain=1)
     for ratio in _RATIOS:
@@ -116,8 +117,8 @@ def _told(
     problem: Problem, one: Estimate, begin: np.ndarray, channels: Sequence[_Channel], ratios: Sequence[float],
     grams: Float[np.ndarray, "channel column column"],
 ) -> Estimate:  # fmt: skip
-    """With what heavier tails gain, the noise that the error adds to, and how far from white the scores are that it
-    leaves."""
+    """With what heavier tails gain and a wrongly given noise owes, the noise that the error adds to unless the noise is
+    what is told, and how far from white the scores are that it leaves."""
     column = np.concatenate([[1.0], begin - one.z])
     errors = np.array([((column @ c.columns[: c.plain]) ** 2).sum() for c in channels])
     number = np.array([max(c.number, 1) for c in channels])
@@ -127,6 +128,9 @@ def _told(
     squares = np.einsum("i,jik,k->j", column, grams, column)
     left = [_left(c.seen, column @ x, square) for c, x, square in zip(channels, cleared, squares, strict=True)]
     value = one.log_evidence + law_gain(problem, one.combination, np.stack(left, axis=1) / one.noise)
+    value += factor_evidence(problem, one.combination, one.noise, number)
+    told = np.isnan(problem.noise_of(one.combination)) & ~np.isnan(problem.noise)
+    total = np.where(told, one.noise, total)
     return replace(one, kind="positional", noise=total, log_evidence=value, inflation=variance_inflation(scores.T))
 
 

@@ -155,7 +155,7 @@ def correlated(
     the choice of the correlations owes.
     """
     combination, noise = fits.combinations[b], fits.noise[b].copy()
-    free = np.isnan(problem.noise)
+    free = np.isnan(problem.noise_of(combination))
     for _ in range(6):
         gram = (grams / (noise**2)[:, None, None]).sum(0)
         offset = -0.5 * float((number * np.log(2 * np.pi * noise**2) + logs).sum())
