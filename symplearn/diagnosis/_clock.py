@@ -21,9 +21,10 @@ from ._problem import Problem
 from ._scatter import law_gain
 from ._weighed import REMAINDER, Estimate, correlated, trusting
 
-# How often sensor and clock are fitted, in turn, each with the other as it is; which of the dampings and memory lengths
-# are tried.
-_TURNS, _DAMPED, _EVERY = 3, 1.0, 2
+# How often sensor and clock are fitted, in turn, each with the other as it is.
+_TURNS = 3
+# Dampings of the clock's error, and how many memory lengths are tried.
+_DAMPINGS, _TIMES = (30.0, 1.001), 5
 
 _squares, _gram, _series = (jax.jit(what) for what in (squares, gram, series))
 _on_grid = jax.jit(jax.vmap(squares, (None, None, None, None, 0)))
@@ -90,13 +91,12 @@ def _pieces(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int) -
 def _fitted(problem: Problem, pieces: Sequence[_Piece], j: int, colour: Colour) -> tuple[Colour, Colour]:
     """The likeliest error of the sensor and of its clock, each found in turn; sizes are against the white noise."""
     known, some = problem.noise[j], [one.middle() for one in pieces]
-    grid = grid_of([one.times for one in pieces])
-    grid = grid[(grid[:, 2] > _DAMPED) & np.isin(grid[:, 1], np.unique(grid[grid[:, 2] > _DAMPED, 1])[::_EVERY])]
+    grid = grid_of([one.times for one in pieces], _DAMPINGS, _TIMES)
     largest = REMAINDER * float(np.nanstd(np.concatenate([r.readings[:, j] for r in problem.rows])))
     both = [colour, replace(colour, ratio=0.0)]
     for turn in range(_TURNS):
         searched = 1 - turn % 2
-        tried = np.append(grid, [_shape(both[searched])], axis=0) if both[searched].ratio else grid
+        tried = np.append(grid, [_shape(both[searched])], axis=0)
         both[searched] = chosen(tried, _values(some, both, searched, tried, known, largest))
     return both[0], both[1]
 

@@ -7,6 +7,7 @@ squares and the evidence follow (Jones 1980; Harvey 1989, section 3.4; Sarkka an
 such processes may add up, each entering a row by a factor of its own.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -149,11 +150,11 @@ def filled(values: np.ndarray) -> Array:
     return jax.device_put(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, lack)]))
 
 
-def grid_of(times: list[np.ndarray]) -> np.ndarray:
-    """Every (ratio, frequency, damping) that is tried: memories from one gap to a quarter of the recording."""
+def grid_of(times: list[np.ndarray], dampings: Sequence[float] = _DAMPINGS, number: int = _TIMES) -> np.ndarray:
+    """Every (ratio, frequency, damping) that is tried: so many memories from one gap to a quarter of the recording."""
     gap = min(float(np.median(np.diff(t))) for t in times)
-    memories = np.geomspace(gap, max(t[-1] - t[0] for t in times) / 4, _TIMES)
-    return np.array([(r, max(2 * z, 1.0) / m, z) for z in _DAMPINGS for m in memories for r in _RATIOS])
+    memories = np.geomspace(gap, max(t[-1] - t[0] for t in times) / 4, number)
+    return np.array([(r, max(2 * z, 1.0) / m, z) for z in dampings for m in memories for r in _RATIOS])
 
 
 def fit_colour(
