@@ -15,19 +15,36 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._calibrate import Fits, Priors, residuals, weights
-from ._coloured import MOST_ROWS, Colour, chosen, filled, gram, grid_of, row_gaps, row_variances, series, squares
+from ._coloured import (
+    MOST_ROWS,
+    RATIOS,
+    Colour,
+    chosen,
+    filled,
+    gram,
+    grid_of,
+    innovations,
+    row_gaps,
+    row_variances,
+    series,
+)
 from ._evidence import variance_inflation
 from ._problem import Problem
-from ._scatter import law_gain
+from ._scatter import law_gain, tail_gain
 from ._weighed import REMAINDER, Estimate, correlated, trusting
 
-# How often sensor and clock are fitted, in turn, each with the other as it is.
-_TURNS = 3
+# How often sensor and clock are fitted, in turn, each with the other as it is; and how often all of that, about the
+# path that follows.
+_TURNS, _PASSES = 3, 2
 # Dampings of the clock's error, and how many memory lengths are tried.
 _DAMPINGS, _TIMES = (30.0, 1.001), 5
+# Steps of the logarithms of (ratio, frequency, damping) of both about the best, as many as the grid has points; and how
+# large they are, in turn.
+_NEARBY = np.random.default_rng(0).normal(size=(len(_DAMPINGS) * _TIMES * len(RATIOS), 2, 3)) * [1.0, 1.0, 0.0]
+_FINER = (1.0, 0.5, 0.25)
 
-_squares, _gram, _series = (jax.jit(what) for what in (squares, gram, series))
-_on_grid = jax.jit(jax.vmap(squares, (None, None, None, None, 0)))
+_gram, _series = jax.jit(gram), jax.jit(series)
+_on_grid = jax.jit(jax.vmap(innovations, (None, None, None, None, 0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +56,11 @@ class _Piece:
     weight: Float[np.ndarray, " row"]
     times: Float[np.ndarray, " row"]
 
-    def middle(self) -> "_Piece":
-        """The rows that the grid is searched with."""
+    def middle(self, column: Float[np.ndarray, " column"]) -> "_Piece":
+        """The rows that shapes are searched with, and their errors, a sum of the columns."""
         begin = max(0, (len(self.times) - MOST_ROWS) // 2)
         some = slice(begin, begin + MOST_ROWS)
-        return _Piece(self.columns[:1, some], self.rates[some], self.weight[some], self.times[some])
+        return _Piece((column @ self.columns)[None, some], self.rates[some], self.weight[some], self.times[some])
 
     @cached_property
     def rows(self) -> tuple[Array, Array, Array]:
@@ -64,10 +81,14 @@ def weigh_clock(
     out = []
     for b in trusting(problem, fits):
         pieces = [_pieces(problem, fits, b, rows, j) for j in range(problem.channels)]
-        both = [_fitted(problem, pieces[j], j, colours[b][j]) for j in range(problem.channels)]
-        grams, logs = zip(*(_gram_of(problem, *one) for one in zip(pieces, both, strict=True)), strict=True)
-        occam = sum(colour.occam + clock.occam for colour, clock in both)
-        one = correlated(problem, fits, b, np.stack(grams), np.array(logs), number, occam, priors)
+        both, z = [(colour, replace(colour, ratio=0.0)) for colour in colours[b]], fits.z[b]
+        for _ in range(_PASSES):  # what is off the path changes what the path is
+            off = fits.z[b] - z
+            both = [_fitted(problem, pieces[j], j, both[j], off) for j in range(problem.channels)]
+            grams, logs = zip(*(_gram_of(problem, *one) for one in zip(pieces, both, strict=True)), strict=True)
+            occam = sum(colour.occam + clock.occam for colour, clock in both)
+            one = correlated(problem, fits, b, np.stack(grams), np.array(logs), number, occam, priors)
+            z = one.z
         out.append(_told(problem, one, fits.z[b], pieces, both))
     return out
 
@@ -88,32 +109,44 @@ def _pieces(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int) -
     return out
 
 
-def _fitted(problem: Problem, pieces: Sequence[_Piece], j: int, colour: Colour) -> tuple[Colour, Colour]:
-    """The likeliest error of the sensor and of its clock, each found in turn; sizes are against the white noise."""
-    known, some = problem.noise[j], [one.middle() for one in pieces]
+def _fitted(
+    problem: Problem, pieces: Sequence[_Piece], j: int, before: tuple[Colour, Colour], off: Float[np.ndarray, " z"]
+) -> tuple[Colour, Colour]:
+    """The likeliest error of the sensor and of its clock, each found in turn, then together; sizes are against the
+    white noise, and all unknowns `off` what the columns were taken at."""
+    known = problem.noise[j]
+    some = [one.middle(np.append(1.0, off[problem.local(k)])) for k, one in enumerate(pieces)]
     grid = grid_of([one.times for one in pieces], _DAMPINGS, _TIMES)
     largest = REMAINDER * float(np.nanstd(np.concatenate([r.readings[:, j] for r in problem.rows])))
-    both = [colour, replace(colour, ratio=0.0)]
+    both = list(before)
     for turn in range(_TURNS):
         searched = 1 - turn % 2
         tried = np.append(grid, [_shape(both[searched])], axis=0)
-        both[searched] = chosen(tried, _values(some, both, searched, tried, known, largest))
-    return both[0], both[1]
+        shapes = np.repeat([[_shape(one) for one in both]], len(tried), axis=0)
+        shapes[:, searched] = tried
+        both[searched] = chosen(tried, _values(some, shapes, known, largest))
+    best = np.array([_shape(one) for one in both])
+    for steps in _NEARBY * np.array(_FINER)[:, None, None, None]:
+        shapes = np.append(best[None], best * np.exp(steps), axis=0)
+        best = shapes[int(np.argmax(_values(some, shapes, known, largest)))]
+    names = ("ratio", "frequency", "damping")
+    sensor, clock = (replace(one, **dict(zip(names, map(float, shape), strict=True)))
+                     for one, shape in zip(both, best, strict=True))  # fmt: skip
+    return sensor, clock
 
 
-def _values(pieces: Sequence[_Piece], both: Sequence[Colour], searched: int, grid, known: float, largest: float):
-    """Log likelihoods of the errors with one of the two colours anywhere on the grid."""
-    shapes = [np.repeat([_shape(one)], len(grid), axis=0) for one in both]
-    shapes[searched] = grid
-    places = tuple(jnp.asarray(part) for part in np.moveaxis(np.stack(shapes, axis=1), 2, 0))
-    square, logs = np.zeros(len(grid)), np.zeros(len(grid))
-    number = sum(int((one.weight > 0).sum()) for one in pieces)
+def _values(pieces: Sequence[_Piece], shapes: Float[np.ndarray, "point both shape"], known: float, largest: float):
+    """Log likelihoods of several shapes of both errors, whose innovations may have heavy tails: clocks leap."""
+    places, logs, parts = tuple(jnp.asarray(part) for part in np.moveaxis(shapes, 2, 0)), np.zeros(len(shapes)), []
     for one in pieces:
-        parts = _on_grid(filled(one.columns), *one.rows, places)
-        square, logs = square + np.asarray(parts[0]), logs + np.asarray(parts[1])
-    white = np.maximum(square, 1e-300) / number if np.isnan(known) else np.full(len(grid), known**2)
-    value = -0.5 * (number * np.log(white) + square / white + logs)
-    return np.where(np.isfinite(value) & (grid[:, 0] * white <= largest**2), value, -np.inf)
+        found, log = _on_grid(filled(one.columns), *one.rows, places)
+        parts.append(np.asarray(found)[:, : len(one.times)][:, one.weight > 0])
+        logs += np.asarray(log)
+    e = np.concatenate(parts, axis=1)
+    white = np.maximum(np.mean(e**2, axis=1), 1e-300) if np.isnan(known) else np.full(len(shapes), known**2)
+    e = e / np.sqrt(white)[:, None]
+    value = -0.5 * (e.shape[1] * np.log(white) + (e**2).sum(1) + logs) + tail_gain(e, bool(np.isnan(known)))
+    return np.where(np.isfinite(value) & (shapes[:, :, 0].max(1) * white <= largest**2), value, -np.inf)
 
 
 def _shape(one: Colour) -> tuple[float, float, float]:

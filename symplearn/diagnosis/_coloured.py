@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 # Variance of the coloured error against the white one, its damping, and how many memory lengths are tried.
-_RATIOS = np.geomspace(0.03, 1e6, 12)
+RATIOS = np.geomspace(0.03, 1e6, 12)
 _DAMPINGS = (30.0, 1.001, 0.3, 0.1)
 _TIMES = 10
 # Rows that the grid is searched with; more would not tell the colour better.
@@ -113,6 +113,16 @@ def series(columns, loadings, variances, gaps, shapes):
     return remembered(columns, loadings, variances, gaps, shapes, visit, jnp.zeros(()))[2]
 
 
+def innovations(columns, loadings, variances, gaps, shapes):
+    """The first column's whitened innovations, row by row, and the sum of the log innovation variances."""
+
+    def visit(total, e, S):
+        return total, e[0] / jnp.sqrt(S)
+
+    _, logs, kept = remembered(columns, loadings, variances, gaps, shapes, visit, jnp.zeros(()))
+    return kept, logs
+
+
 def _alone(what):
     """One process, of the same size in every row."""
 
@@ -154,7 +164,7 @@ def grid_of(times: list[np.ndarray], dampings: Sequence[float] = _DAMPINGS, numb
     """Every (ratio, frequency, damping) that is tried: so many memories from one gap to a quarter of the recording."""
     gap = min(float(np.median(np.diff(t))) for t in times)
     memories = np.geomspace(gap, max(t[-1] - t[0] for t in times) / 4, number)
-    return np.array([(r, max(2 * z, 1.0) / m, z) for z in dampings for m in memories for r in _RATIOS])
+    return np.array([(r, max(2 * z, 1.0) / m, z) for z in dampings for m in memories for r in RATIOS])
 
 
 def fit_colour(

@@ -42,26 +42,30 @@ def law_gain(problem: Problem, combination: Combination, errors: Float[np.ndarra
     for j in range(errors.shape[1]):
         e = errors[~np.isnan(errors[:, j]), j]
         if len(e) and np.mean(e**2) < _ASTRAY:
-            free = bool(np.isnan(known[j]))
-            total += float(np.logaddexp(0.0, _student(e, free) - _gaussian(e, free)) - np.log(2.0))
+            total += float(tail_gain(e, bool(np.isnan(known[j]))))
     return total
 
 
-def _gaussian(e: np.ndarray, free: bool) -> float:
+def tail_gain(e: Float[np.ndarray, "*lane row"], free: bool) -> Float[np.ndarray, "*lane"]:
+    """The same of one channel, for several series of innovations; the noise's size is `free`, or one."""
+    return np.asarray(np.logaddexp(0.0, _student(e, free) - _gaussian(e, free)) - np.log(2.0))
+
+
+def _gaussian(e: np.ndarray, free: bool) -> np.ndarray:
     """Log likelihood of the Gaussian, its scale the best one where it is free, else one."""
-    scale = float(np.sqrt(np.mean(e**2))) if free else 1.0
-    return float(norm.logpdf(e, scale=max(scale, 1e-150)).sum())
+    square = np.maximum(np.mean(e**2, axis=-1, keepdims=True), 1e-300) if free else np.ones(1)
+    return np.asarray(-0.5 * (np.log(2 * np.pi * square) + e**2 / square).sum(-1))
 
 
-def _student(e: np.ndarray, free: bool) -> float:
+def _student(e: np.ndarray, free: bool) -> np.ndarray:
     """Log likelihood of Student's t, its scale the best one where it is free, else that of unit variance."""
     f = _FREEDOM
-    square = (f - 2) / f
+    square = np.full((*e.shape[:-1], 1), (f - 2) / f)
     for _ in range(30 if free else 0):
-        square = float(np.mean((f + 1) / (f + e**2 / square) * e**2))
-        square = max(square, 1e-300)
+        square = np.mean((f + 1) / (f + e**2 / square) * e**2, axis=-1, keepdims=True)
+        square = np.maximum(square, 1e-300)
     constant = gammaln((f + 1) / 2) - gammaln(f / 2) - 0.5 * np.log(f * np.pi * square)
-    return float(len(e) * constant - 0.5 * (f + 1) * np.log1p(e**2 / (f * square)).sum())
+    return np.asarray((constant - 0.5 * (f + 1) * np.log1p(e**2 / (f * square))).sum(-1))
 
 
 def factor_evidence(
@@ -121,7 +125,7 @@ def _stand_apart(e: Float[np.ndarray, " row"], far: Bool[np.ndarray, " row"]) ->
         scales = scales.refined(x, scales.belongs(x))
     if scales.share > _SHARE:
         return np.zeros_like(far)
-    one = max(float(norm.logpdf(x, scale=np.sqrt(np.mean(x**2))).sum()), _student(x, True))
+    one = max(float(_gaussian(x, True)), float(_student(x, True)))
     if scales.log_likelihood(x) > one + _APART:
         out[seen] |= scales.belongs(x) > _CLEARLY
     return out
