@@ -69,6 +69,7 @@ class _Piece:
         return filled(loadings), row_variances(self.weight), row_gaps(self.times)
 
 
+@np.errstate(all="ignore")  # a lane that diverged is told by its evidence
 def weigh_clock(
     problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int], colours: Sequence[Sequence[Colour]]
 ) -> list[Estimate]:
@@ -93,7 +94,6 @@ def weigh_clock(
     return out
 
 
-@np.errstate(all="ignore")  # a lane that diverged is told by its evidence
 def _pieces(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int) -> list[_Piece]:
     weight = weights(problem, rows)
     times = [r.times[:n] for r, n in zip(problem.rows, rows, strict=True)]
