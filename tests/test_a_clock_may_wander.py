@@ -10,6 +10,7 @@ from test_coloured_errors_are_whitened import autocovariance, irregular_times
 from symplearn.diagnosis._calibrate import calibrate
 from symplearn.diagnosis._clock import _gram_of, _Piece, weigh_clock
 from symplearn.diagnosis._coloured import Colour
+from symplearn.diagnosis._found import Found
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
 from symplearn.diagnosis._weighed import weigh_coloured, weigh_white
@@ -51,8 +52,8 @@ def late(seed):
     return 0.02 * np.array(x)
 
 
-def evidences(delay, seed=2):
-    """Log evidences of drag, which is true, and of a viscous damping, by kind of remainder."""
+def weighed(delay, seed=2):
+    """Drag, which is true, and a viscous damping, under noise alone, an error of the sensor, and one of its clock."""
     rates = lambda t, x: [x[1], -x[0] - 0.03 * abs(x[1]) * x[1]]  # noqa: E731
     q = cases.solved(rates, [1.0, 0.0], np.append(-1.0, TIMES + delay))[1:, 0]
     p = problem(q + NOISE * np.random.default_rng(seed).normal(size=len(q)))
@@ -65,23 +66,26 @@ def evidences(delay, seed=2):
     rows = [len(TIMES)]
     fits = calibrate(Stepper(p), begin, laws, priors, rows)
     assert fits.converged.all()
-    coloured = weigh_coloured(p, fits, priors, rows)
+    coloured, found = weigh_coloured(p, fits, priors, rows), Found(p, priors)
     clock = weigh_clock(p, fits, priors, rows, [one.colours for one in coloured])
-    white = weigh_white(p, fits, priors, rows)
-    return {k: [one.log_evidence for one in each] for k, each in
-            (("white", white), ("coloured", coloured), ("clock", clock))}  # fmt: skip
+    for one in (*weigh_white(p, fits, priors, rows), *coloured, *clock):
+        found.add(one)
+    return found, laws
 
 
 def test_amplitudes_tell_laws_apart_beside_a_wandering_clock():
     """Where rows are read up to a hundredth of a cycle too early or too late, the clock is the likeliest remainder, and
     under it the true law is ahead of another by more than under an error of the sensor that remembers itself."""
-    found = evidences(late(0))
-    assert found["clock"][0] > found["coloured"][0] + 20 > found["white"][0] + 20
-    (drag, viscous), (other, worse) = found["clock"], found["coloured"]
+    found, laws = weighed(late(0))
+    values = {kind: [found.of(law, kind).log_evidence for law in laws] for kind in ("white", "coloured", "clock")}
+    assert values["clock"][0] > values["coloured"][0] + 20 > values["white"][0] + 20
+    (drag, viscous), (other, worse) = values["clock"], values["coloured"]
     assert drag - viscous > other - worse + 10
+    # It names the law; a run goes on from what does not excuse the phase.
+    assert found.shown(laws[0], found.of(laws[0], "clock")) is found.of(laws[0], "coloured")
 
 
 def test_a_clock_that_keeps_time_explains_nothing():
     """No evidence is gained where rows are read when they say."""
-    found = evidences(np.zeros(len(TIMES)))
-    assert found["clock"][0] < found["white"][0] + 1.0
+    found, (drag, _) = weighed(np.zeros(len(TIMES)))
+    assert found.of(drag, "clock").log_evidence < found.of(drag, "white").log_evidence + 1.0

@@ -1,5 +1,6 @@
 """Everything that was weighed, by combination and kind of remainder."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from ._weighed import Estimate, Mode
 # Two optima whose places differ by more than this many standard deviations are two modes.
 _APART = 2.0
 # Nats that an estimate which did not converge must be ahead to be reported nevertheless.
-UNCONVERGED = 3.0
+_UNCONVERGED = 3.0
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,11 @@ class Ahead:
 
     score: float
     holds: bool
+
+
+def speaker(estimates: Sequence[Estimate]) -> Estimate:
+    """The estimate of the best kind of remainder; one that converged is preferred to one barely ahead that did not."""
+    return max(estimates, key=lambda e: e.log_evidence - (0.0 if e.converged else _UNCONVERGED))
 
 
 @dataclass
@@ -56,7 +62,7 @@ class Found:
         elif np.isfinite(one.log_evidence):
             modes.append(one)
         top = max(mode.log_evidence for mode in modes)
-        lead = UNCONVERGED * (int(old.converged) - int(new.converged))
+        lead = _UNCONVERGED * (int(old.converged) - int(new.converged))
         better = new if one.log_evidence >= max(mode.log_evidence for mode in old.modes) + lead else old
         total = float(logsumexp([mode.log_evidence for mode in modes])) if np.isfinite(top) else -np.inf
         return replace(better, log_evidence=total, modes=tuple(modes))
@@ -81,7 +87,11 @@ class Found:
 
     def shown(self, combination: Combination, best: Estimate) -> Estimate:
         """The estimate to run on: where a clear remainder is left, the trajectory fit if that holds on ahead, as wide
-        as its errors are long-lived."""
+        as its errors are long-lived. A clock that may wander excuses the phase, which a run goes on from; there the
+        best of the others."""
+        others = [one for one in self.estimates[combination] if one.kind != best.kind]
+        if best.kind == "clock" and others:
+            best = speaker(others)
         white = self.of(combination, "white")
         one = self.ahead.get(combination)
         if one is None or not one.holds or white is None or not white.converged:

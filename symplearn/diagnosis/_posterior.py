@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._effects import IMPULSE, prices
-from ._found import UNCONVERGED, Found
+from ._found import Found, speaker
 from ._problem import Combination, Problem
 from ._strength import faint_share
 from ._weighed import Estimate
@@ -62,7 +62,7 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     factor = 1.0 / max(1.0, inflation)
     top = max(e.log_evidence for es in found.estimates.values() for e in es)
     if not np.isfinite(top):
-        return Posterior(0.0, 1.0, (), 0.0, _speaker(found.estimates[()]), {(): -np.inf}, factor)
+        return Posterior(0.0, 1.0, (), 0.0, speaker(found.estimates[()]), {(): -np.inf}, factor)
     unseen = min((one.score for one in found.ahead.values()), default=0.0)
     white, other, named = -np.inf, -np.inf, []
     evidences: dict[Combination, float] = {}
@@ -78,7 +78,7 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
             white, other = plain, noisy
         elif any(e.converged for e in estimates) and _informed(problem, found, combination):
             weight = float(np.log([price[c] for c in combination]).sum())
-            named.append((combination, weight, total, _speaker(estimates)))
+            named.append((combination, weight, total, speaker(estimates)))
     with np.errstate(divide="ignore"):
         faint = white + np.log(_unseen(problem, found, whole))
     logs = np.array([white, np.log(remainder) + other, faint, *(w + total for _, w, total, _ in named)])
@@ -90,7 +90,7 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
         unexplained=float(probability[1]),
         named=tuple(Weighed(c, float(p), float(total), best) for (c, _, total, best), p in ranked),
         faint=float(probability[2]),
-        nothing=_speaker(found.estimates[()]),
+        nothing=speaker(found.estimates[()]),
         evidences=evidences,
         tempered=factor,
     )
@@ -116,11 +116,6 @@ def _faint(problem: Problem, found: Found, combination: Combination) -> float | 
     best = max(found.estimates[combination], key=lambda e: e.log_evidence)
     sd = float(np.sqrt(best.covariance[place.start, place.start]) / found.priors.scales[one.first])
     return faint_share(sd) if sd < _UNINFORMED else None
-
-
-def _speaker(estimates: Sequence[Estimate]) -> Estimate:
-    """The estimate of the best kind of remainder; one that converged is preferred to one barely ahead that did not."""
-    return max(estimates, key=lambda e: e.log_evidence - (0.0 if e.converged else UNCONVERGED))
 
 
 def _mixture(values: Sequence[float]) -> float:
