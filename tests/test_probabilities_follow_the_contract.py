@@ -279,6 +279,16 @@ def test_of_two_estimates_of_one_kind_the_better_counts(problem):
         assert kept.best(one) == 2.0 and len(kept.estimates[one]) == 1
 
 
+def test_what_converged_stands_before_what_is_barely_ahead(problem):
+    """Of two fits of one kind the one that converged is reported unless the other is three nats ahead, in whichever
+    order they came."""
+    one = singles(problem)[0]
+    for ahead, is_reported in ((2.0, True), (4.0, False)):
+        stopped = replace(estimate(problem, one, ahead), converged=False)
+        for pair in ((stopped, estimate(problem, one, 0.0)), (estimate(problem, one, 0.0), stopped)):
+            assert found(problem, *pair).of(one, "white").converged is is_reported
+
+
 def test_optima_at_different_times_add_up(problem):
     """Two impulses at times that are far apart are two modes of one effect; the same one from two starts is one."""
     one = place(problem, "impulse", "q1")
