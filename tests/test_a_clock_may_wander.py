@@ -38,7 +38,7 @@ def test_sensor_and_clock_are_integrated_out_together():
     S = (sensor + np.outer(rates, rates) * clock)[np.ix_(seen, seen)] + np.diag(1 / weight[seen])
     expected = columns[:, seen] @ np.linalg.solve(S, columns[:, seen].T)
     place = np.concatenate([[0], 1 + p.local(0)])
-    # Covariances of condition up to 1e5 cost the dense solution five of sixteen digits.
+    # Covariances of condition up to 1e5 cost the dense solution five of sixteen digits, here and in the determinant.
     np.testing.assert_allclose(gram[np.ix_(place, place)], expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
     assert log == pytest.approx(np.linalg.slogdet(S)[1], rel=1e-8)
 

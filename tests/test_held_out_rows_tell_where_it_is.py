@@ -58,6 +58,7 @@ def test_fit_and_held_out_rows_together_are_the_fit_of_all_rows(learnt):
     sd = np.sqrt(np.diag(covariance))
     # Tails of Student's t take a tenth of the weight of the held-out readings, which are a quarter of all.
     assert np.all(np.abs(found.mean[where] - expected) < 0.3 * sd)
+    # The same tenth, of which a standard deviation takes half: twice that is allowed.
     spread = (found.root @ found.root.T)[np.ix_(where, where)]
     np.testing.assert_allclose(np.sqrt(np.diag(spread)), sd, rtol=0.1)
     before = np.sqrt(np.diag(estimate.covariance))[[0, stepper.problem.state // 2, stepper.problem.head]]

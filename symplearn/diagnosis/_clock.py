@@ -21,12 +21,10 @@ from ._coloured import (
     Colour,
     chosen,
     filled,
-    gram,
     grid_of,
-    innovations,
     row_gaps,
     row_variances,
-    series,
+    whitened,
 )
 from ._evidence import variance_inflation
 from ._problem import Problem
@@ -43,8 +41,8 @@ _DAMPINGS, _TIMES = (30.0, 1.001), 5
 _NEARBY = np.random.default_rng(0).normal(size=(len(_DAMPINGS) * _TIMES * len(RATIOS), 2, 3)) * [1.0, 1.0, 0.0]
 _FINER = (1.0, 0.5, 0.25)
 
-_gram, _series = jax.jit(gram), jax.jit(series)
-_on_grid = jax.jit(jax.vmap(innovations, (None, None, None, None, 0)))
+_whitened = jax.jit(whitened)
+_on_grid = jax.jit(jax.vmap(whitened, (None, None, None, None, 0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +76,11 @@ def weigh_clock(
     `colours` are those of the sensors alone, by lane and channel. None for a combination with a wrongly given noise.
     """
     weight = weights(problem, rows)
+    errors = residuals(problem, fits.predictions, weight)
     number = sum((w > 0).sum(0) for w in weight)
     out = []
     for b in trusting(problem, fits):
-        pieces = [_pieces(problem, fits, b, rows, j) for j in range(problem.channels)]
+        pieces = [_pieces(problem, fits, [x[b, :, j] for x in errors], weight, b, j) for j in range(problem.channels)]
         both, z = [(colour, replace(colour, ratio=0.0)) for colour in colours[b]], fits.z[b]
         for _ in range(_PASSES):  # what is off the path changes what the path is
             off = fits.z[b] - z
@@ -94,17 +93,18 @@ def weigh_clock(
     return out
 
 
-def _pieces(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int) -> list[_Piece]:
-    weight = weights(problem, rows)
-    times = [r.times[:n] for r, n in zip(problem.rows, rows, strict=True)]
+def _pieces(
+    problem: Problem, fits: Fits, errors: Sequence[np.ndarray], weight: Sequence[np.ndarray], b: int, j: int
+) -> list[_Piece]:
+    times = [r.times[: len(w)] for r, w in zip(problem.rows, weight, strict=True)]
     rates = [np.gradient(p.readings[b, :, j], t) if len(t) > 1 else np.ones(len(t))
              for p, t in zip(fits.predictions, times, strict=True)]  # fmt: skip
     size = np.sqrt(np.mean(np.concatenate(rates) ** 2))
     out = []
-    for k, x in enumerate(residuals(problem, fits.predictions, weight)):
+    for k, x in enumerate(errors):
         w = weight[k][:, j]
         slopes = np.where(w > 0, fits.predictions[k].slopes[b, :, :, j], 0.0)
-        columns = np.concatenate([x[b, None, :, j], slopes])
+        columns = np.concatenate([x[None], slopes])
         out.append(_Piece(columns, np.nan_to_num(rates[k] / (size or 1.0)), w, times[k]))
     return out
 
@@ -140,7 +140,7 @@ def _values(pieces: Sequence[_Piece], shapes: Float[np.ndarray, "point both shap
     places, logs, parts = tuple(jnp.asarray(part) for part in np.moveaxis(shapes, 2, 0)), np.zeros(len(shapes)), []
     for one in pieces:
         found, log = _on_grid(filled(one.columns), *one.rows, places)
-        parts.append(np.asarray(found)[:, : len(one.times)][:, one.weight > 0])
+        parts.append(np.asarray(found)[:, : len(one.times), 0][:, one.weight > 0])
         logs += np.asarray(log)
     e = np.concatenate(parts, axis=1)
     white = np.maximum(np.mean(e**2, axis=1), 1e-300) if np.isnan(known) else np.full(len(shapes), known**2)
@@ -163,9 +163,9 @@ def _gram_of(problem: Problem, pieces: Sequence[_Piece], both: Sequence[Colour])
     full, total = np.zeros((1 + problem.size, 1 + problem.size)), 0.0
     for k, one in enumerate(pieces):
         place = np.concatenate([[0], 1 + problem.local(k)])
-        mine, log = _gram(filled(one.columns), *one.rows, _shapes(both))
-        full[np.ix_(place, place)] += np.asarray(mine)
-        total += float(log)
+        series, log = _cleared(one, both)
+        full[np.ix_(place, place)] += series.T @ series
+        total += log
     return full, total
 
 
@@ -177,16 +177,18 @@ def _told(
     errors, scores = [], []
     for k in range(len(problem.rows)):
         column = np.concatenate([[1.0], (begin - one.z)[problem.local(k)]])
-        whitened = [_whitened(piece[k], shape, noise)
-                    for piece, shape, noise in zip(pieces, both, one.noise, strict=True)]  # fmt: skip
-        left = [np.where(piece[k].weight > 0, x @ column, np.nan) for piece, x in zip(pieces, whitened, strict=True)]
+        series = [_cleared(piece[k], shape)[0] / noise
+                  for piece, shape, noise in zip(pieces, both, one.noise, strict=True)]  # fmt: skip
+        left = [np.where(piece[k].weight > 0, x @ column, np.nan) for piece, x in zip(pieces, series, strict=True)]
         errors.append(np.stack(left, axis=1))
-        scores.append(sum((x @ column)[:, None] * x[:, 1 + problem.state :] for x in whitened))
+        scores.append(sum((x @ column)[:, None] * x[:, 1 + problem.state :] for x in series))
     value = one.log_evidence + law_gain(problem, one.combination, np.concatenate(errors))
     colours, clocks = zip(*both, strict=True)
     inflation = variance_inflation(np.concatenate(scores))
     return replace(one, kind="clock", log_evidence=value, colours=colours, clocks=clocks, inflation=inflation)
 
 
-def _whitened(one: _Piece, both: Sequence[Colour], noise: float) -> Float[np.ndarray, "row column"]:
-    return np.asarray(_series(filled(one.columns), *one.rows, _shapes(both)))[: len(one.times)] / noise
+def _cleared(one: _Piece, both: Sequence[Colour]) -> tuple[Float[np.ndarray, "row column"], float]:
+    """Whitened columns in units of the white sd, and the log determinant that the whitening leaves."""
+    series, log = _whitened(filled(one.columns), *one.rows, _shapes(both))
+    return np.asarray(series)[: len(one.times)], float(log)

@@ -104,20 +104,11 @@ def gram(columns, loadings, variances, gaps, shapes):
     return remembered(columns, loadings, variances, gaps, shapes, visit, jnp.zeros((size, size)))[:2]
 
 
-def series(columns, loadings, variances, gaps, shapes):
-    """The whitened columns, row by row."""
+def whitened(columns, loadings, variances, gaps, shapes):
+    """The whitened columns (row, column), and the sum of the log innovation variances."""
 
     def visit(total, e, S):
         return total, e / jnp.sqrt(S)
-
-    return remembered(columns, loadings, variances, gaps, shapes, visit, jnp.zeros(()))[2]
-
-
-def innovations(columns, loadings, variances, gaps, shapes):
-    """The first column's whitened innovations, row by row, and the sum of the log innovation variances."""
-
-    def visit(total, e, S):
-        return total, e[0] / jnp.sqrt(S)
 
     _, logs, kept = remembered(columns, loadings, variances, gaps, shapes, visit, jnp.zeros(()))
     return kept, logs
@@ -133,8 +124,8 @@ def _alone(what):
     return done
 
 
-_series = jax.jit(_alone(series))
-_lanes = jax.jit(jax.vmap(_alone(series), (0, None, None, 0, 0, 0)))
+_series = jax.jit(_alone(whitened))
+_lanes = jax.jit(jax.vmap(_alone(whitened), (0, None, None, 0, 0, 0)))
 _on_grid = jax.jit(jax.vmap(jax.vmap(_alone(squares), (None, None, None, 0, 0, 0)), (0, *[None] * 5)))
 _grams = jax.jit(jax.vmap(_alone(gram), (0, None, None, 0, 0, 0)))
 
@@ -231,7 +222,7 @@ def whitened_residuals(
     """Every lane's residuals whitened by its own colour, in units of its white sd."""
     shape = [np.array([getattr(c, f) for c in colours]) for f in ("ratio", "frequency", "damping")]
     rows = row_variances(weight), row_gaps(times)
-    parts = [_lanes(filled(residuals[c][:, None]), *rows, *(jax.device_put(s[c]) for s in shape))
+    parts = [_lanes(filled(residuals[c][:, None]), *rows, *(jax.device_put(s[c]) for s in shape))[0]
              for c in _chunks(len(residuals))]  # fmt: skip
     return np.concatenate([np.asarray(part)[..., 0] for part in parts])[: len(residuals), : len(times)]
 
@@ -244,4 +235,4 @@ def whitened_series(
 ) -> Float[np.ndarray, "time column"]:
     """The whitened columns of one lane, row by row, in units of the white sd."""
     shape = (jax.device_put(x) for x in (colour.ratio, colour.frequency, colour.damping))
-    return np.asarray(_series(filled(columns), row_variances(weight), row_gaps(times), *shape))[: len(times)]
+    return np.asarray(_series(filled(columns), row_variances(weight), row_gaps(times), *shape)[0])[: len(times)]
