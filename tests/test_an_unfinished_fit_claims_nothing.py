@@ -11,7 +11,7 @@ from symplearn.diagnosis._calibrate import calibrate
 from symplearn.diagnosis._scan import noise_starts
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
-from symplearn.diagnosis._weighed import weigh_white
+from symplearn.diagnosis._weighed import correlated, weigh_white
 
 GIVEN, TRUE = 0.05, 0.1
 TIMES = 0.2 * np.arange(60)
@@ -83,3 +83,13 @@ def test_a_wrong_noise_is_tried_beside_an_effect(stepper, priors):
     assert len(start.combination) == 2
     place = dict(problem.placed(start.combination))[drag]
     np.testing.assert_array_equal(start.z[place], fits.z[0][dict(problem.placed((drag,)))[drag]])
+
+
+def test_round_off_claims_nothing(stepper, priors):
+    """Squared errors below zero, as round-off leaves them of a trajectory that ran away, are no evidence."""
+    fits = calibrate(stepper, priors.mean[None], [()], priors, [len(TIMES)])
+    grams = np.zeros((1, 1 + stepper.problem.size, 1 + stepper.problem.size))
+    grams[0, 0, 0] = -1e6
+    number = np.array([len(TIMES)])
+    claimed = correlated(stepper.problem, fits, 0, grams, np.zeros(1), number, 0.0, priors)
+    assert claimed.log_evidence == -np.inf

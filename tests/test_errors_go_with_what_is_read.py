@@ -66,7 +66,7 @@ def test_a_bent_scale_is_seen_as_one():
     white, coloured, positional = evidences(0.03)
     assert positional.kind == "positional"
     assert positional.log_evidence > coloured.log_evidence + 10 > white.log_evidence + 20
-    assert NOISE < positional.noise[0] < 0.05  # the bend alone has an rms of 0.024
+    assert NOISE < positional.reading_noise[0] < 0.05  # the bend alone has an rms of 0.024
     assert positional.inflation < white.inflation
 
 
@@ -75,7 +75,20 @@ def test_white_noise_goes_with_nothing():
     white, _, positional = evidences(0.0)
     assert positional.log_evidence < white.log_evidence + 1.0
     # An sd estimated from 400 readings has an error of 3.5 %: three of those.
-    assert positional.noise[0] == pytest.approx(NOISE, rel=0.1)
+    assert positional.reading_noise[0] == pytest.approx(NOISE, rel=0.1)
+
+
+def test_averages_share_the_bend():
+    """Of rows that are averages of nine readings the bend is what the fit leaves beside the scatter, not three times
+    that: nine readings at one place err alike."""
+    p, fits, priors = fitted(0.03)
+    averaged = replace(p, rows=(replace(p.rows[0], counts=np.full((len(TIMES), 1), 9.0)),))
+    fits = calibrate(Stepper(averaged), fits.z, [()], priors, [len(TIMES)])
+    (positional,) = weigh_positional(averaged, fits, priors, [len(TIMES)])
+    left = averaged.rows[0].readings - fits.predictions[0].readings[0]
+    bend = np.sqrt((left**2).mean() - NOISE**2)
+    # The polynomials' own estimate of what is white among 400 rows: 3.5 % of the noise, and less of the bend.
+    assert positional.noise[0] * np.sqrt(positional.bent[0]) == pytest.approx(bend, rel=0.1)
 
 
 def test_heavy_tails_speak_for_no_remainder():

@@ -6,8 +6,10 @@ import engine_cases as cases
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.stats import norm
 
 from symplearn.diagnosis._calibrate import calibrate
+from symplearn.diagnosis._outlook import Outlook
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._taught import root_of, taught
 from symplearn.diagnosis._trajectory import Stepper
@@ -32,14 +34,16 @@ def spring(outlier=0.0):
     return stepper, weigh_white(p, fits, priors, rows)[0], y
 
 
+def swing(x, times):
+    """The spring's closed form from start and stiffness."""
+    w = np.sqrt(x[2])
+    return x[0] * np.cos(w * times) + x[1] / w * np.sin(w * times)
+
+
 def closed_form(y):
-    """Start and stiffness by SciPy's least squares on the closed form, from all rows, and their covariance."""
-
-    def errors(x):
-        w = np.sqrt(x[2])
-        return (x[0] * np.cos(w * TIMES) + x[1] / w * np.sin(w * TIMES) - y) / NOISE
-
-    found = least_squares(errors, [1.0, 0.3, 1.1], x_scale="jac", xtol=1e-12)
+    """Start and stiffness by SciPy's least squares on the closed form, from all rows of `y`, and their covariance."""
+    times = TIMES[: len(y)]
+    found = least_squares(lambda x: (swing(x, times) - y) / NOISE, [1.0, 0.3, 1.1], x_scale="jac", xtol=1e-12)
     return found.x, np.linalg.inv(found.jac.T @ found.jac)
 
 
@@ -63,6 +67,26 @@ def test_fit_and_held_out_rows_together_are_the_fit_of_all_rows(learnt):
     np.testing.assert_allclose(np.sqrt(np.diag(spread)), sd, rtol=0.1)
     before = np.sqrt(np.diag(estimate.covariance))[[0, stepper.problem.state // 2, stepper.problem.head]]
     assert (before > 1.2 * sd).any()
+
+
+def test_held_out_density_knows_that_the_stiffness_is_uncertain(learnt):
+    """The log density of the held-out readings is that of SciPy's predictive Gaussians from the fitted rows, less an
+    error of the stiffness four times as large as it is; with the stiffness taken as known it would be far below."""
+    stepper, estimate, *_ = learnt
+    y = stepper.problem.rows[0].readings[:, 0]
+    fitted = stepper.problem.rows[0].fitted
+    mean, covariance = closed_form(y[:fitted])
+    late = TIMES[fitted:]
+    steps = np.linalg.cholesky(covariance).T
+    slopes = np.stack([swing(mean + step, late) - swing(mean, late) for step in steps])
+    spread = np.sqrt((slopes**2).sum(0) + NOISE**2)
+    expected = norm.logpdf(y[fitted:], swing(mean, late), spread).sum()
+    outlook = Outlook(stepper, estimate, 0, np.zeros(1))
+    # The start's own spread is half of it, as the filter has the rows twice: a nat or two over 50 rows.
+    assert outlook.held_out_log_density(1.0) == pytest.approx(expected, abs=2.0)
+    variance = outlook._unsure(16.0)[:, 0]
+    at = np.argmax(np.abs(slopes).sum(0))
+    assert variance[at] == pytest.approx(16 * (slopes[:, at] ** 2).sum(), rel=0.5)
 
 
 def test_an_outlier_among_them_moves_little():

@@ -142,8 +142,8 @@ class Answer:
     def _document(self, seconds: float) -> dict[str, Any]:
         p, spread = self.posterior, self._spread()
         rows, other = document.alternatives(self.problem, p, self.verdict, self.chosen)
-        before = document.fit(self.problem, self.pull or self.before, self.without, self.recordings)
-        after = document.fit(self.problem, self.after, self.with_, self.recordings) if self.chosen else before
+        before = document.fit(self.problem, self.pull or self.before, self.without, self.recordings, spread)
+        after = document.fit(self.problem, self.after, self.with_, self.recordings, spread) if self.chosen else before
         return {
             "schema": "symplearn.diagnosis/1",
             "verdict": self.verdict,

@@ -28,12 +28,12 @@ def parameters(problem: Problem, estimate: Estimate, inflation: float) -> dict[s
 
 
 def fit(
-    problem: Problem, needed: Estimate, outlooks: Sequence[Outlook], recordings: Sequence[Recording]
+    problem: Problem, needed: Estimate, outlooks: Sequence[Outlook], recordings: Sequence[Recording], inflation: float
 ) -> dict[str, Any]:
     """Held-out error of the free run in the columns' units, its log density, and the noises.
 
     Free run and density are those of `outlooks`. `needed` holds the process noise and the reading noise that it takes
-    to follow the fitted rows.
+    to follow the fitted rows. `inflation` multiplies the posterior covariance of the unknowns.
     """
     columns, momenta = problem.equations.columns, problem.equations.momenta
     squares, numbers, density = np.zeros(len(columns)), np.zeros(len(columns)), 0.0
@@ -43,7 +43,7 @@ def fit(
             error = outlook.held_out_errors(recording.times[held], recording.readings[held])
             squares += np.nansum(error**2, axis=0)
             numbers += (~np.isnan(error)).sum(0)
-            density += outlook.held_out_log_density()
+            density += outlook.held_out_log_density(inflation)
     with np.errstate(invalid="ignore", divide="ignore"):
         rmse = np.sqrt(squares / numbers)
     held_out = any((r.times > o.rows.boundary).any() for o, r in zip(outlooks, recordings, strict=True))
@@ -52,7 +52,7 @@ def fit(
         "holdout_rmse": {c: finite(x) for c, x in zip(columns, rmse, strict=True)} if held_out else None,
         "holdout_log_density": finite(density) if held_out else None,
         "process_noise_sd": {p: float(x) for p, x in zip(momenta, intensity, strict=True)},
-        "noise_sd": {c: finite(x) for c, x in zip(columns, needed.noise, strict=True)},
+        "noise_sd": {c: finite(x) for c, x in zip(columns, needed.reading_noise, strict=True)},
     }
 
 

@@ -51,7 +51,7 @@ def searched(
     found = search.run()
     best = max((e for es in found.estimates.values() for e in es), key=lambda e: e.log_evidence)
     if np.isfinite(best.log_evidence):
-        finer, _ = refined(rebuild, finer, best.z, best.noise, substep, best.combination)
+        finer, _ = refined(rebuild, finer, best.z, best.reading_noise, substep, best.combination)
         if finer is not stepper.problem:
             options.progress("weighing the best combinations again in finer steps")
             found = search.again(Stepper(finer, options.jobs))

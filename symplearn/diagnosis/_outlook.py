@@ -1,29 +1,32 @@
 """One hypothesis shown on the recordings: filtered where it was fitted, run freely where it was not."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
 from .._filter import Filtered
 from .._smoother import Smoothed
+from .._triangular import semidefinite_cholesky
 from ._along import What, along, readings
+from ._problem import Problem
 from ._stochastic import free_run, row_roots, run_filter, run_smoother
 from ._trajectory import Stepper
 from ._weighed import Estimate
 
 
 def colour_ratio(estimate: Estimate) -> Float[np.ndarray, " channel"]:
-    """Variance of the reading error with a memory over the white one, by channel; zero where there is none."""
-    both = [estimate.colours, estimate.clocks]
-    return sum((np.array([c.ratio for c in each]) for each in both if each), np.zeros(len(estimate.noise)))
+    """Variance of the reading error that lasts, by memory or by place, over the white one; zero where there is none."""
+    kinds = [[c.ratio for c in estimate.colours], [c.ratio for c in estimate.clocks], estimate.bent]
+    return sum((np.array(each) for each in kinds if each), np.zeros(len(estimate.noise)))
 
 
 def total_noise(estimate: Estimate) -> Float[np.ndarray, " channel"]:
-    """White and coloured reading noise together, so that a filter without a colour does not trust too much."""
+    """White reading noise and errors that last together, so that a filter without these does not trust too much."""
     return estimate.noise * np.sqrt(1.0 + colour_ratio(estimate))
 
 
@@ -37,6 +40,23 @@ def start_spread(stepper: Stepper, estimate: Estimate, recording: int) -> Float[
     state = stepper.problem.state
     part = slice(recording * state, (recording + 1) * state)
     return estimate.covariance[part, part]
+
+
+def one_off(problem: Problem, e: Estimate, recording: int, inflation: float) -> list[Float[np.ndarray, " z"]]:
+    """The unknowns with one after the other of those that are no phase point off by its standard deviation."""
+    local, state = problem.local(recording), problem.state
+    own = np.concatenate([local[state:], local[:state]])
+    root = np.asarray(semidefinite_cholesky(jnp.asarray(e.covariance[np.ix_(own, own)] * inflation)))
+    out, c = [], problem.calibrated
+    lowest = problem.lower_bounds(e.combination)
+    for k in np.nonzero(np.diag(root)[: len(local) - state])[0]:
+        z = e.z.copy()
+        z[own] += root[:, k]
+        z[problem.head : problem.slots] = np.clip(z[problem.head : problem.slots], c.lower, c.upper)
+        for entry, low in lowest.items():
+            z[entry] = max(z[entry], low)
+        out.append(z)
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,16 +136,26 @@ class Outlook:
             )
         )
 
-    def held_out_log_density(self) -> float:
-        """Sum over held-out rows of the log density of each reading around the free run, with the filter's spread."""
+    def held_out_log_density(self, inflation: float) -> float:
+        """Sum over held-out rows of the log density of each reading around the free run, with the spread of the filter
+        and of the unknowns; `inflation` multiplies their posterior covariance."""
         first = self.rows.fitted
         weight = self._roots()[first:] ** 2
         S = np.asarray(self._filtered[1].innovation_covariances[first : len(self.rows.times)])
-        variance = np.diagonal(S, axis1=1, axis2=2) / weight
+        variance = np.diagonal(S, axis1=1, axis2=2) / weight + self._unsure(inflation)
         error = self.rows.readings[first:] - self.readings[first:]
         seen = ~np.isnan(error)
         terms = -0.5 * (np.log(2 * np.pi * variance) + np.where(seen, error, 0.0) ** 2 / variance)
         return float(terms[seen].sum())
+
+    def _unsure(self, inflation: float) -> Float[np.ndarray, "held channel"]:
+        """Variance of the held-out free run that unknown parameters leave: each of them off by one standard deviation
+        in turn, those before it being known and the start following. What diverges then says nothing."""
+        first, variance = self.rows.fitted, np.zeros_like(self.readings[self.rows.fitted :])
+        for z in one_off(self.stepper.problem, self.estimate, self.recording, inflation):
+            other = replace(self, estimate=replace(self.estimate, z=z)).readings[first:]
+            variance += np.nan_to_num((other - self.readings[first:]) ** 2, posinf=0.0)
+        return variance
 
     def _roots(self) -> np.ndarray:
         return row_roots(self.stepper.problem, self.recording, len(self.rows.times), colour_ratio(self.estimate))

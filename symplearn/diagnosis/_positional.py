@@ -117,12 +117,12 @@ def _told(
     problem: Problem, one: Estimate, begin: np.ndarray, channels: Sequence[_Channel], ratios: Sequence[float],
     grams: Float[np.ndarray, "channel column column"],
 ) -> Estimate:  # fmt: skip
-    """With what heavier tails gain and a wrongly given noise owes, the noise that the error adds to unless the noise is
-    what is told, and how far from white the scores are that it leaves."""
+    """With what heavier tails gain and a wrongly given noise owes, the error's size unless the noise is what is told,
+    and how far from white the scores are that it leaves."""
     column = np.concatenate([[1.0], begin - one.z])
     errors = np.array([((column @ c.columns[: c.plain]) ** 2).sum() for c in channels])
     number = np.array([max(c.number, 1) for c in channels])
-    total = np.sqrt(np.maximum(errors / number, one.noise**2))
+    total = np.maximum(errors / number, one.noise**2)
     cleared = [c.cleared(ratio) for c, ratio in zip(channels, ratios, strict=True)]
     scores = sum(x[1:] * (column @ x) / noise**2 for x, noise in zip(cleared, one.noise, strict=True))
     squares = np.einsum("i,jik,k->j", column, grams, column)
@@ -130,8 +130,11 @@ def _told(
     value = one.log_evidence + law_gain(problem, one.combination, np.stack(left, axis=1) / one.noise)
     value += factor_evidence(problem, one.combination, one.noise, number)
     told = np.isnan(problem.noise_of(one.combination)) & ~np.isnan(problem.noise)
-    total = np.where(told, one.noise, total)
-    return replace(one, kind="positional", noise=total, log_evidence=value, inflation=variance_inflation(scores.T))
+    # Averaging readings does not make the error smaller that they share.
+    averaged = np.exp([c.log_weights / max(c.number, 1) for c in channels])
+    bent = np.where(told, 0.0, (total / one.noise**2 - 1.0) / averaged)
+    inflation = variance_inflation(scores.T)
+    return replace(one, kind="positional", bent=tuple(bent.tolist()), log_evidence=value, inflation=inflation)
 
 
 def _left(seen: Bool[np.ndarray, " row"], errors: np.ndarray, square: float) -> Float[np.ndarray, " row"]:

@@ -32,7 +32,7 @@ class Estimate:
 
     `kind` is `white` (no remainder), `coloured` (an error of the sensor with a memory), `clock` (one of its clock
     beside that), `positional` (one that goes with what is read) or `force` (a white missing force of `intensity`).
-    `noise` is the white sd of one original reading, with the rms of a positional error.
+    `noise` is the white sd of one original reading, `bent` the variance of a positional error against its square.
     """
 
     combination: Combination
@@ -46,9 +46,15 @@ class Estimate:
     intensity: Float[np.ndarray, " d"] | None = None
     paths: list[np.ndarray] | None = field(default=None, repr=False)
     colours: tuple[Colour, ...] = ()
+    bent: tuple[float, ...] = ()
     clocks: tuple[Colour, ...] = ()  # errors of the times, as the rms error of the reading that they make
     modes: tuple[Mode, ...] = ()  # all optima that were found, this one among them
     outliers: tuple[tuple[float, float], ...] = ()  # share and size by channel, where they were left out
+
+    @property
+    def reading_noise(self) -> Float[np.ndarray, " channel"]:
+        """Sd of one original reading, with the rms of a positional error."""
+        return self.noise * np.sqrt(1.0 + np.array(self.bent or 0.0))
 
 
 def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -> list[Estimate]:
@@ -165,6 +171,8 @@ def correlated(
         noise = np.where(free, np.sqrt(np.maximum(square, 1e-300) / np.maximum(number, 1)), noise)
     z = fits.z[b] + one.step
     value = _earned(one, fits, b) + occam + strength_gain(problem, combination, priors, z, one.covariance)
+    if (square < 0).any():  # round-off of a trajectory that ran away
+        value = -np.inf
     return Estimate(combination, "", z, one.covariance, noise, value, bool(fits.converged[b]))
 
 
