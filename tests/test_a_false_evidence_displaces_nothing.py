@@ -6,6 +6,7 @@ import engine_cases as cases
 import numpy as np
 import pytest
 
+from symplearn.diagnosis._refinement import Refinement
 from symplearn.diagnosis._score import Start
 from symplearn.diagnosis._search import Search
 from symplearn.diagnosis._start import first_fits, priors_without_effects
@@ -44,7 +45,8 @@ def test_what_did_not_converge_is_fitted_again():
     finer ones."""
     search, damping = damped_spring()
     (settled,) = (e for e in search.found.estimates[(damping,)] if e.kind == "white")
-    for again in (search._move_places, lambda: search.again(search.stepper)):
+    move = Refinement(search.prospects, search.progress).move_places
+    for again in (move, lambda: search.again(search.stepper)):
         short = settled.z + 0.3 * np.sqrt(np.diag(settled.covariance))
         search.found.estimates[(damping,)] = [replace(settled, z=short, converged=False)]
         again()

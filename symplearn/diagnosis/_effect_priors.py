@@ -31,6 +31,11 @@ def rms(values: np.ndarray) -> float:
     return mean if np.isfinite(mean) and mean > 0 else 1.0
 
 
+def extent(paths: Sequence[Float[np.ndarray, "_ state"]]) -> float:
+    """How far paths lead: the mean logarithm of their columns' root mean squares."""
+    return float(np.mean([np.log(rms(column)) for column in np.concatenate(paths).T]))
+
+
 @dataclass(frozen=True)
 class Motion:
     """The motion that was recorded, as the simulation without effects follows it; rows of all recordings."""

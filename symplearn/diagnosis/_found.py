@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import logsumexp
 
 from ._calibrate import Priors
+from ._prices import Prices
 from ._problem import Combination, Problem
 from ._weighed import Estimate, Mode
 
@@ -84,6 +86,15 @@ class Found:
     def best(self, combination: Combination) -> float:
         """The largest log evidence of a combination over kinds."""
         return max((e.log_evidence for e in self.estimates[combination]), default=-np.inf)
+
+    @cached_property
+    def prices(self) -> Prices:
+        """The prior of every combination."""
+        return Prices(self.problem, self.choices)
+
+    def odds(self, combination: Combination) -> float:
+        """The same with the combination's prior: what its probability goes with."""
+        return self.best(combination) + self.prices.log(combination)
 
     def shown(self, combination: Combination, best: Estimate) -> Estimate:
         """The estimate to run on: where a clear remainder is left, the trajectory fit if that holds on ahead, as wide

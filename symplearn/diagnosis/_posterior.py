@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._effects import IMPULSE, prices
 from ._found import Found, speaker
 from ._problem import Combination, Problem
 from ._strength import faint_share
@@ -15,8 +14,6 @@ from ._weighed import Estimate
 _UNINFORMED = 0.7
 # The simulation counts as consistent unless the probability of nothing left out is below this (contract).
 CONSISTENT = 0.05
-# Prior share of a change in time that begins anew in every one of several recordings.
-_ANEW = 1.0 / 30.0
 # Kinds of remainder other than white noise; each combination divides its remainder's prior among them.
 _REMAINDERS = ("coloured", "clock", "positional", "force")
 
@@ -52,13 +49,7 @@ class Posterior:
 
 def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     """Weigh every combination by evidence and the contract's prior (section 4)."""
-    candidates = [problem.equations.candidates[i] for i in problem.searched]
-    families = sorted({c.effect.family for c in candidates} | {"any"})
-    remainder = 1.0 / len(families)
-    whole = {problem.searched[i]: p for i, p in prices(candidates, families).items()}
-    price = {m: _share(problem, m) * whole[problem.whole(m)] for c in found.estimates for m in c
-             if m not in found.choices}  # fmt: skip
-    price |= {m: remainder * float(np.exp(-choices)) for m, choices in found.choices.items()}
+    remainder = found.prices.remainder
     factor = 1.0 / max(1.0, inflation)
     top = max(e.log_evidence for es in found.estimates.values() for e in es)
     if not np.isfinite(top):
@@ -77,10 +68,9 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
         if not combination:
             white, other = plain, noisy
         elif any(e.converged for e in estimates) and _informed(problem, found, combination):
-            weight = float(np.log([price[c] for c in combination]).sum())
-            named.append((combination, weight, total, speaker(estimates)))
+            named.append((combination, found.prices.log(combination), total, speaker(estimates)))
     with np.errstate(divide="ignore"):
-        faint = white + np.log(_unseen(problem, found, whole))
+        faint = white + np.log(_unseen(problem, found))
     logs = np.array([white, np.log(remainder) + other, faint, *(w + total for _, w, total, _ in named)])
     probability = np.exp(logs - logs.max())
     probability /= probability.sum()
@@ -96,7 +86,7 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     )
 
 
-def _unseen(problem: Problem, found: Found, price: dict[int, float]) -> float:
+def _unseen(problem: Problem, found: Found) -> float:
     """Prior of the effects that were not fitted, as far as they are too weak to be seen: on average as those that were.
 
     Where the simulation nearly follows the recording only those of the highest scores are fitted.
@@ -104,7 +94,7 @@ def _unseen(problem: Problem, found: Found, price: dict[int, float]) -> float:
     alone = [c for c in found.estimates if len(c) == 1]
     shares = [share for c in alone if (share := _faint(problem, found, c)) is not None]
     fitted = {problem.whole(m) for (m,) in alone}
-    return sum(p for m, p in price.items() if m not in fitted) * float(np.mean(shares)) if shares else 0.0
+    return sum(p for m, p in found.prices.whole.items() if m not in fitted) * float(np.mean(shares)) if shares else 0.0
 
 
 def _faint(problem: Problem, found: Found, combination: Combination) -> float | None:
@@ -139,23 +129,3 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
         scales = found.priors.scales[one.first : one.first + one.effect.amplitudes]
         known &= bool((sd[amplitudes] < _UNINFORMED * scales).all())
     return bool(np.isfinite(best.log_evidence) and known)
-
-
-def _share(problem: Problem, member: int) -> float:
-    """Of an effect and target's prior, half goes to all recordings and the rest to the choices among them.
-
-    Little of it where a change in time would have to begin anew in every recording, as their clocks do.
-    """
-    variants, one = len(problem.variants(member)), problem.candidate(member)
-    if one.effect is IMPULSE:
-        return 1.0 / len(problem.rows)
-    if variants == 0:
-        return 1.0
-    every = _ANEW if one.effect.family == "time variation" and _clocks_overlap(problem) else 0.5
-    return every if member == problem.whole(member) else (1.0 - every) / variants
-
-
-def _clocks_overlap(problem: Problem) -> bool:
-    """Whether two recordings claim the same time."""
-    spans = sorted((float(r.times[0]), float(r.times[-1])) for r in problem.rows)
-    return any(later[0] < earlier[1] for earlier, later in zip(spans[:-1], spans[1:], strict=True))

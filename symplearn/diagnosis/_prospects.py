@@ -15,6 +15,8 @@ from ._tangent import sharp_units
 from ._weighed import Estimate
 from ._weigher import Weigher
 
+# Places at which an effect is tried beside the best of a size.
+MANY = 160
 # Effects of the highest scores that may take another's part, beside all those without a place.
 _EXCHANGED = 24
 # Starts about one motion that are fitted first, and the share of a promise that may be wrong.

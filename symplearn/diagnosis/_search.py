@@ -8,13 +8,13 @@ import numpy as np
 
 from .._effects import NOISE, OUTLIERS
 from ._calibrate import Priors
-from ._effect_priors import motion_along, with_effects, with_unnamed
+from ._effect_priors import extent, motion_along, with_effects, with_unnamed
 from ._found import Found
 from ._noisy import PathFit, fit_paths
 from ._null_paths import beside, null_paths
 from ._problem import MOST, Combination, Problem
-from ._prospects import Prospects, promising
-from ._scan import spacing
+from ._prospects import MANY, Prospects, promising
+from ._refinement import Refinement
 from ._score import Start
 from ._start import priors_without_effects, with_states
 from ._stochastic import free_run
@@ -33,10 +33,10 @@ _SMALL, _ALIKE = 24, 4
 _FORCED = 6
 # Combinations that are fitted between two looks at the clock.
 _BATCH = 24
-# Combinations whose places are moved, how near they are to the best; and those that are weighed again in finer steps.
-_MOVED, _NEAR, _AGAIN = 3, 8.0, 24
-# Places at which an effect is tried beside the best of the size below, and beside others.
-_MANY, _FEW = 160, 60
+# Combinations that are weighed again in finer steps.
+_AGAIN = 24
+# Places at which an effect is tried beside others than the best of the size below.
+_FEW = 60
 _ONE_MORE = {1: "one effect", 2: "a second effect", 3: "a third effect"}
 
 
@@ -80,8 +80,7 @@ class Search:
                 break
             if size > 1 and not self._gained(size):
                 break
-        self._move_places()
-        self._weigh_subsets()
+        self._refine()
         self._weigh_clocks()
         self.progress("weighing missing forces beside the best combinations")
         self._weigh_forces()
@@ -104,10 +103,10 @@ class Search:
         self.progress("following the recording with a missing force")
         paths = null_paths(w.stepper, self.seed, self.rows, bare, w.path_steps)
         self.null_paths = [replace(fit, combination=self.base) for fit in paths]
-        best = self._null
-        motion = motion_along(self.problem, best.z, best.paths)
+        z, likely = self._likely_paths()
+        motion = motion_along(self.problem, z, likely)
         self.typical = motion.forces
-        w.found.priors = with_effects(self.problem, with_states(self.problem, bare, best.paths), motion)
+        w.found.priors = with_effects(self.problem, with_states(self.problem, bare, likely), motion)
         self.progress("weighing the simulation as it is")
         self._weigh_nothing()
         self.null_paths = self._paths_again()
@@ -119,12 +118,26 @@ class Search:
         again = fit_paths(w.stepper, paths, w.found.priors, self.rows, 3)
         if white is None or not white.converged:
             return again
-        begins = [white.z[r * self.problem.state : (r + 1) * self.problem.state] for r in range(len(self.rows))]
-        states = [free_run(self.problem, w.stepper.courses[r], white.z, self.base, r, x, 0)[1][: self.rows[r]]
-                  for r, x in enumerate(begins)]  # fmt: skip
+        states = self._trajectories(white.z)
         starts = [replace(fit, z=white.z, noise=white.noise, paths=states, laplace=None) for fit in paths]
         near = fit_paths(w.stepper, starts, w.found.priors, self.rows, w.path_steps)
         return [max(pair, key=lambda fit: fit.log_evidence) for pair in zip(again, near, strict=True)]
+
+    def _likely_paths(self) -> tuple[np.ndarray, list[np.ndarray]]:
+        """A motion like the recorded one, with its unknowns: the best path; where that has not settled, the smaller of
+        it and of the best trajectory: near a singularity a missing force throws a path far out."""
+        best = self._null
+        ways = [(best.z, best.paths)]
+        if not best.converged:
+            ways.append((self.seeds[0], self._trajectories(self.seeds[0])))
+        some = [way for way in ways if all(np.isfinite(path).all() for path in way[1])]
+        return min(some or ways[:1], key=lambda way: extent(way[1]))
+
+    def _trajectories(self, z: np.ndarray) -> list[np.ndarray]:
+        """Phase points of the simulation without effects at all fitted rows, by recording."""
+        p, courses = self.problem, self.weigher.stepper.courses
+        begins = [z[r * p.state : (r + 1) * p.state] for r in range(len(self.rows))]
+        return [free_run(p, courses[r], z, self.base, r, x, 0)[1][: self.rows[r]] for r, x in enumerate(begins)]
 
     def _weigh_nothing(self) -> None:
         """The simulation as it is, from many starts: a local optimum here would look like physics left out."""
@@ -145,14 +158,15 @@ class Search:
     def again(self, stepper: Stepper) -> Found:
         """Fit and weigh the best combinations anew with another stepper of the same recordings."""
         w, before = self.weigher, self.found
-        ranked = sorted(before.estimates, key=before.best, reverse=True)[:_AGAIN]
+        ranked = sorted(before.estimates, key=before.odds, reverse=True)[:_AGAIN]
         # What did not converge may promise more than there is; it stays, but nothing falls behind it.
-        sound = [e.log_evidence for c in ranked for e in before.estimates[c] if e.converged]
-        kept = [c for c in ranked if before.best(c) > max(sound, default=-np.inf) - _REACH]
+        sound = [e.log_evidence + before.prices.log(c) for c in ranked for e in before.estimates[c] if e.converged]
+        kept = [c for c in ranked if before.odds(c) > max(sound, default=-np.inf) - _REACH]
         w.moved_to(stepper, Found(stepper.problem, before.priors, complete=before.complete))
         mine = [c for c in dict.fromkeys([self.base, *kept]) if self._is_mine(c)]
         w.weigh([Start(c, white.z, 0.0) for c in mine if (white := before.of(c, "white"))], whole=True)
-        self._move_places()
+        if self._in_time():
+            Refinement(self.prospects, self.progress).move_places()
         w.add_paths(fit_paths(w.stepper, self.null_paths, w.found.priors, self.rows, 3))
         self._weigh_clocks()
         self._weigh_forces()
@@ -184,33 +198,13 @@ class Search:
         self._add_forces([combination], 1)
         return self.found
 
-    def _move_places(self) -> None:
-        """Try the best combinations with their times, thresholds and frequencies moved by steps of the grid, and those
-        that did not converge from where they are: damped anew, many get where they were going."""
-        ranked = sorted(self.found.estimates, key=self.found.best, reverse=True)
-        near = [c for c in ranked if self.found.best(c) > self.found.best(ranked[0]) - _NEAR and self._is_mine(c)]
-        starts = []
-        for k, c in enumerate(near if self._in_time() else []):
-            white = self.found.of(c, "white")
-            assert white is not None  # every combination is weighed under white noise first
-            starts += [] if white.converged else [Start(c, white.z, 0.0)]
-            for member, place in self.problem.placed(c) if k < _MOVED else []:
-                if self.problem.candidate(member).effect.places:
-                    starts += [Start(c, z, 0.0) for z in self._moved(white.z, member, place.stop - 1)]
-        if starts:
-            self.progress("moving times, thresholds and frequencies")
-            self.weigher.weigh(starts, whole=True)
-
-    def _moved(self, z: np.ndarray, member: int, entry: int) -> list[np.ndarray]:
-        one, priors = self.problem.candidate(member), self.found.priors
-        low, high = priors.lower[one.values.stop - 1], priors.upper[one.values.stop - 1]
-        step = spacing(one, low, high)
-        out = []
-        for k in (-3, -1, 1, 3):
-            if low < z[entry] + k * step < high:
-                out.append(z.copy())
-                out[-1][entry] += k * step
-        return out
+    def _refine(self) -> None:
+        """The best once more from elsewhere, with what may do as well, and with what is left without a member."""
+        refinement = Refinement(self.prospects, self.progress)
+        for part in (refinement.move_places, refinement.weigh_like_the_best):
+            if self._in_time():
+                part()
+        refinement.weigh_subsets()
 
     def _is_mine(self, combination: Combination) -> bool:
         """Whether the outliers that were taken out are part of it."""
@@ -242,7 +236,7 @@ class Search:
             white = self.found.of(c, "white")
             assert white is not None  # every combination is weighed under white noise first
             # Thinned frequencies miss an oscillation that stays in tune throughout, so the best one has more of them.
-            mine = self.prospects.about(c, _FEW if k else _MANY)
+            mine = self.prospects.about(c, _FEW if k else MANY)
             promised = [replace(start, gain=start.gain + white.log_evidence) for start in mine]
             # As many of each: what a score promises about a poor fit is too much.
             self._keep(promised, kept)
@@ -252,7 +246,7 @@ class Search:
 
     def _weigh_exchanged(self, combination: Combination, size: int, number: int) -> None:
         """Combinations of a size that may do as well as the best one, from where a regression about it puts them."""
-        starts = [s for s in self.prospects.exchanged(combination, _MANY, size, number) if s.gain > -_REACH]
+        starts = [s for s in self.prospects.exchanged(combination, MANY, size, number) if s.gain > -_REACH]
         if starts:  # from a trajectory that all rows are near to
             self.weigher.weigh(starts, whole=True)
 
@@ -270,7 +264,7 @@ class Search:
         From where the scores put them if the simulation nearly follows the recording; else from nothing, in a growing
         window. Once one is found that follows it, the others begin where a regression about that one puts them.
         """
-        scanned = self.prospects.about(self.base, _MANY)
+        scanned = self.prospects.about(self.base, MANY)
         if self._is_near(0):
             if small := self._varied(scanned):
                 self.weigher.weigh(small, whole=True)
@@ -342,39 +336,9 @@ class Search:
         mine = [self.found.best(c) for c in self.found.estimates if self._size(c) == size]
         return max(mine, default=-np.inf) > smaller + _WORTH
 
-    def _weigh_subsets(self) -> None:
-        """What the best combinations become without each of their members, from where they are: what was weighed
-        already may have been caught in a poorer optimum, which would make the member look needed."""
-        ranked = sorted(filter(self._is_worth_it, self.found.estimates), key=self.found.best, reverse=True)[:KEPT]
-        less = dict.fromkeys(c[:k] + c[k + 1 :] for c in ranked for k in range(len(c)) if c[k] not in self.base)
-        some = [c for c in less if c and (c not in self.found.estimates or self._is_behind(c, ranked))]
-        if some:
-            self.weigher.weigh([Start(c, self._shrunk(c, ranked), 0.0) for c in some[: 2 * KEPT]], whole=True)
-
-    def _is_worth_it(self, combination: Combination) -> bool:
-        """Whether no part of a combination does better without the rest."""
-        less = [c for c in self.found.estimates if set(c) < set(combination)]
-        return bool(combination) and self.found.best(combination) > max(map(self.found.best, less), default=-np.inf)
-
-    def _is_behind(self, combination: Combination, ranked: Sequence[Combination]) -> bool:
-        """Whether one member more is worth something."""
-        larger = [self.found.best(c) for c in ranked if set(combination) < set(c)]
-        return self.found.best(combination) < max(larger)
-
-    def _shrunk(self, combination: Combination, ranked: Sequence[Combination]) -> np.ndarray:
-        """Where a combination begins that lacks one member of a fitted one: at that one's values."""
-        larger = next(c for c in ranked if set(combination) < set(c))
-        white = self.found.of(larger, "white")
-        assert white is not None
-        z, where = white.z.copy(), dict(self.problem.placed(larger))
-        z[self.problem.slots :] = 0.0
-        for member, place in self.problem.placed(combination):
-            z[place] = white.z[where[member]]
-        return z
-
     def _weigh_clocks(self) -> None:
         """The best combinations again where the clock may wander; none where the very best leaves no remainder."""
-        ranked = sorted(self.found.estimates, key=self.found.best, reverse=True)
+        ranked = sorted(self.found.estimates, key=self.found.odds, reverse=True)
         top, white = self.found.best(ranked[0]), self.found.of(ranked[0], "white")
         if white is None or white.log_evidence < top:
             self.progress("weighing errors of the clock")
@@ -383,7 +347,7 @@ class Search:
 
     def _weigh_forces(self) -> None:
         """Best combinations again, each with a missing force beside it; only the very best where that needs none."""
-        named = sorted((c for c in self.found.estimates if self._size(c)), key=self.found.best, reverse=True)
+        named = sorted((c for c in self.found.estimates if self._size(c)), key=self.found.odds, reverse=True)
         self._add_forces(named[:1], 2)
         kinds = {e.kind: e.log_evidence for c in named[:1] for e in self.found.estimates[c]}
         if kinds.pop("force", -np.inf) > max(kinds.values(), default=np.inf):

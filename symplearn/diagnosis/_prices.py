@@ -1,0 +1,68 @@
+"""The contract's prior of a combination (section 4): the product of its members' prices."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from .._effects import IMPULSE, prices
+from ._problem import Combination, Problem
+
+# Prior share of a change in time that begins anew in every one of several recordings.
+_ANEW = 1.0 / 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class Prices:
+    """Prior probabilities of effects on targets in recordings, relative to that of nothing left out.
+
+    `choices` is the log of how many expressions a force without a name was chosen from, by member.
+    """
+
+    problem: Problem
+    choices: Mapping[int, float]
+
+    @cached_property
+    def remainder(self) -> float:
+        """Of a remainder without a name: one family's share."""
+        return 1.0 / len(self._families)
+
+    @cached_property
+    def whole(self) -> dict[int, float]:
+        """Of every effect and target that is searched, in whichever recordings."""
+        found = prices([self.problem.equations.candidates[i] for i in self.problem.searched], self._families)
+        return {self.problem.searched[i]: p for i, p in found.items()}
+
+    def log(self, combination: Combination) -> float:
+        """Log prior of a combination against nothing left out."""
+        return float(np.log([self._of(member) for member in combination]).sum())
+
+    @cached_property
+    def _families(self) -> list[str]:
+        candidates = [self.problem.equations.candidates[i] for i in self.problem.searched]
+        return sorted({c.effect.family for c in candidates} | {"any"})
+
+    def _of(self, member: int) -> float:
+        if member in self.choices:
+            return self.remainder * float(np.exp(-self.choices[member]))
+        return self._share(member) * self.whole[self.problem.whole(member)]
+
+    def _share(self, member: int) -> float:
+        """Of an effect and target's prior, half goes to all recordings and the rest to the choices among them.
+
+        Little of it where a change in time would have to begin anew in every recording, as their clocks do.
+        """
+        variants, one = len(self.problem.variants(member)), self.problem.candidate(member)
+        if one.effect is IMPULSE:
+            return 1.0 / len(self.problem.rows)
+        if variants == 0:
+            return 1.0
+        every = _ANEW if one.effect.family == "time variation" and self._clocks_overlap else 0.5
+        return every if member == self.problem.whole(member) else (1.0 - every) / variants
+
+    @cached_property
+    def _clocks_overlap(self) -> bool:
+        """Whether two recordings claim the same time."""
+        spans = sorted((float(r.times[0]), float(r.times[-1])) for r in self.problem.rows)
+        return any(later[0] < earlier[1] for earlier, later in zip(spans[:-1], spans[1:], strict=True))

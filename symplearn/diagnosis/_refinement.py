@@ -1,0 +1,108 @@
+"""The best combinations weighed once more: with their places moved, beside what may do as well, and less one member."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ._found import Found
+from ._problem import MOST, Combination, Problem
+from ._prospects import MANY, Prospects
+from ._scan import spacing
+from ._score import Start
+from ._weigher import KEPT, Weigher
+
+# Combinations whose places are moved, and how near the best one is what is looked at.
+_MOVED, _NEAR = 3, 8.0
+# Combinations like the best of a size that are fitted, and how far behind a regression may see them.
+_ALIKE, _BEHIND = 8, 30.0
+
+
+class Refinement:
+    """Weighs more about the likeliest combinations that a search has found."""
+
+    def __init__(self, prospects: Prospects, progress: Callable[[str], None]):
+        self.prospects, self.progress = prospects, progress
+        self.weigher: Weigher = prospects.weigher
+
+    @property
+    def found(self) -> Found:
+        return self.weigher.found
+
+    @property
+    def problem(self) -> Problem:
+        return self.weigher.problem
+
+    def move_places(self) -> None:
+        """Try the best combinations with their times, thresholds and frequencies moved by steps of the grid, and those
+        that did not converge from where they are: damped anew, many get where they were going."""
+        ranked = sorted(self._mine(), key=self.found.odds, reverse=True)
+        near = [c for c in ranked if self.found.odds(c) > self.found.odds(ranked[0]) - _NEAR]
+        starts = []
+        for k, c in enumerate(near):
+            white = self.found.of(c, "white")
+            assert white is not None  # every combination is weighed under white noise first
+            starts += [] if white.converged else [Start(c, white.z, 0.0)]
+            for member, place in self.problem.placed(c) if k < _MOVED else []:
+                if self.problem.candidate(member).effect.places:
+                    starts += [Start(c, z, 0.0) for z in self._moved(white.z, member, place.stop - 1)]
+        if starts:
+            self.progress("moving times, thresholds and frequencies")
+            self.weigher.weigh(starts, whole=True)
+
+    def weigh_like_the_best(self) -> None:
+        """What may do as well as the likeliest of every size: some fell behind on the way, from where they began."""
+        self.progress("weighing what may do as well")
+        base = len(self.weigher.base)
+        for size in range(1, MOST - base + 1):
+            mine = [c for c in self._mine() if len(c) == size + base]
+            best = max(mine, key=self.found.odds, default=None)
+            if best is not None and self.found.odds(best) > max(map(self.found.odds, self._mine())) - _NEAR:
+                starts = [s for s in self.prospects.exchanged(best, MANY, size, _ALIKE) if s.gain > -_BEHIND]
+                if starts:
+                    self.weigher.weigh(starts, whole=True)
+
+    def weigh_subsets(self) -> None:
+        """What the best combinations become without each of their members, from where they are: what was weighed
+        already may have been caught in a poorer optimum, which would make the member look needed."""
+        base = self.weigher.base
+        ranked = sorted(filter(self._is_worth_it, self.found.estimates), key=self.found.best, reverse=True)[:KEPT]
+        less = dict.fromkeys(c[:k] + c[k + 1 :] for c in ranked for k in range(len(c)) if c[k] not in base)
+        some = [c for c in less if c and (c not in self.found.estimates or self._is_behind(c, ranked))]
+        if some:
+            self.weigher.weigh([Start(c, self._shrunk(c, ranked), 0.0) for c in some[: 2 * KEPT]], whole=True)
+
+    def _mine(self) -> list[Combination]:
+        """Combinations that the outliers which were taken out are part of."""
+        return [c for c in self.found.estimates if set(self.weigher.base) <= set(c)]
+
+    def _moved(self, z: np.ndarray, member: int, entry: int) -> list[np.ndarray]:
+        one, priors = self.problem.candidate(member), self.found.priors
+        low, high = priors.lower[one.values.stop - 1], priors.upper[one.values.stop - 1]
+        step = spacing(one, low, high)
+        out = []
+        for k in (-3, -1, 1, 3):
+            if low < z[entry] + k * step < high:
+                out.append(z.copy())
+                out[-1][entry] += k * step
+        return out
+
+    def _is_worth_it(self, combination: Combination) -> bool:
+        """Whether no part of a combination does better without the rest."""
+        less = [c for c in self.found.estimates if set(c) < set(combination)]
+        return bool(combination) and self.found.best(combination) > max(map(self.found.best, less), default=-np.inf)
+
+    def _is_behind(self, combination: Combination, ranked: Sequence[Combination]) -> bool:
+        """Whether one member more is worth something."""
+        larger = [self.found.best(c) for c in ranked if set(combination) < set(c)]
+        return self.found.best(combination) < max(larger)
+
+    def _shrunk(self, combination: Combination, ranked: Sequence[Combination]) -> np.ndarray:
+        """Where a combination begins that lacks one member of a fitted one: at that one's values."""
+        larger = next(c for c in ranked if set(combination) < set(c))
+        white = self.found.of(larger, "white")
+        assert white is not None
+        z, where = white.z.copy(), dict(self.problem.placed(larger))
+        z[self.problem.slots :] = 0.0
+        for member, place in self.problem.placed(combination):
+            z[place] = white.z[where[member]]
+        return z

@@ -1,0 +1,81 @@
+"""What is likeliest is weighed to the end: many larger combinations do not displace it, and its rivals are tried."""
+
+from dataclasses import replace
+
+import engine_cases as cases
+import numpy as np
+import pytest
+
+from symplearn.diagnosis._noisy import PathFit
+from symplearn.diagnosis._refinement import Refinement
+from symplearn.diagnosis._score import Start
+from symplearn.diagnosis._search import Search
+from symplearn.diagnosis._start import first_fits, priors_without_effects
+from symplearn.diagnosis._trajectory import Stepper
+
+TIMES = np.linspace(0.0, 20.0, 120)
+
+
+def searched(rates, start, hamiltonian, noise):
+    """A search of a recording that SciPy made, before its first step."""
+    q = cases.solved(rates, start, TIMES)[:, 0]
+    y = q + noise * np.random.default_rng(0).normal(size=len(q))
+    stepper = Stepper(cases.problem(cases.simulation(hamiltonian), [cases.recorded(TIMES, y)], 0.1))
+    p = stepper.problem
+    seeds = first_fits(stepper, priors_without_effects(p), [r.fitted for r in p.rows])
+    return Search(stepper, seeds.z, np.inf, lambda message: None)
+
+
+def member(search, name):
+    """The effect of that name on the only coordinate."""
+    p = search.problem
+    return next(m for m in p.searched if p.candidate(m).effect.name == name)
+
+
+@pytest.fixture(scope="module")
+def damped():
+    """A damped spring of which nothing and the damping were weighed."""
+    search = searched(lambda t, x: [x[1], -x[0] - 0.01 * x[1]], [1.0, 0.0], "p**2/2 + q**2/2", 0.01)
+    search._begin()
+    search.weigher.weigh([Start((member(search, "viscous_damping"),), search.seed, 0.0)], whole=True)
+    return search
+
+
+@pytest.mark.slow
+def test_many_larger_combinations_displace_no_likelier_one(damped):
+    """Thirty pairs and triples a nat above the damping, each far less likely for its prior, do not keep it from being
+    weighed in finer steps."""
+    damping = (member(damped, "viscous_damping"),)
+    before = dict(damped.found.estimates)
+    white = damped.found.of(damping, "white")
+    others = [m for m in damped.problem.searched if m not in damping][:30]
+    for other in others:
+        larger = tuple(sorted((*damping, other)))
+        above = replace(white, combination=larger, log_evidence=white.log_evidence + 1)
+        damped.found.estimates[larger] = [above]
+    assert damped.found.best(larger) > damped.found.best(damping)
+    assert damping in damped.again(damped.stepper).estimates
+    damped.found.estimates = before
+
+
+@pytest.mark.slow
+def test_what_may_do_as_well_is_weighed(damped):
+    """Quadratic drag and dry friction, which were never weighed, are after the best one's rivals were looked for."""
+    names = ("quadratic_drag", "coulomb_friction")
+    rivals = [(member(damped, name),) for name in names]
+    for rival in rivals:
+        damped.found.estimates.pop(rival, None)
+    Refinement(damped.prospects, damped.progress).weigh_like_the_best()
+    assert any(rival in damped.found.estimates for rival in rivals)
+
+
+def test_a_path_that_was_thrown_out_sets_no_scale():
+    """A path that has not settled and leads a thousand times as far as the motion is passed over for the best
+    trajectory; one that has settled is not."""
+    search = searched(lambda t, x: [x[1], -x[0]], [1.0, 0.0], "p**2/2 + q**2/2", 0.01)
+    far = [np.stack([1e3 * np.sin(TIMES), np.zeros_like(TIMES), 1e3 * np.cos(TIMES), np.zeros_like(TIMES)], axis=1)]
+    search.null_paths = [PathFit((), np.ones(1), search.seed, np.full(1, 0.01), far)]
+    _, paths = search._likely_paths()
+    assert np.abs(paths[0]).max() < 2
+    search.null_paths = [replace(search.null_paths[0], converged=True)]
+    assert search._likely_paths()[1] is far
