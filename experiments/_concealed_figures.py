@@ -65,7 +65,7 @@ def reliability(found: Mapping[str, Any]) -> Figure:
         for x, y, k in zip(beside, right, n, strict=True):
             axes.annotate(str(k), (x, y), xytext=(4, -9), textcoords="offset points", fontsize=7, color=colour)
     axes.set(xlim=(0, 1.02), ylim=(-0.02, 1.05), xlabel="reported probability", ylabel="frequency of being right")
-    axes.legend(frameon=False, fontsize=8, loc="upper left")
+    figure.legend(frameon=False, fontsize=8, loc="outside upper center", ncols=2)  # inside it would cover a point
     return figure
 
 

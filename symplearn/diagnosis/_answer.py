@@ -115,7 +115,7 @@ class Answer:
             equation_after=equation_lines(*lines, chosen),
             series=tuple(self._series(r) for r in range(len(self.recordings))),
             augmented=augmented(f, self.problem, self.after, values, self.expressions),
-            forecast=self._forecast(),
+            forecast=self.forecast,
         )
 
     @cached_property
@@ -169,6 +169,7 @@ class Answer:
                 self.after,
                 self.without,
                 self.with_,
+                self.forecast,
             ),
             "thinning": {
                 "rows": sum(r.given for r in self.problem.rows),
@@ -321,7 +322,9 @@ class Answer:
         means = np.asarray(outlook.smoothed.means[: outlook.rows.fitted])
         return outlook.along(energy, means)
 
-    def _forecast(self) -> Forecast | None:
+    @cached_property
+    def forecast(self) -> Forecast | None:
+        """Readings to come, where they were asked for."""
         if self.times is None:
             return None
         return forecast(self.stepper, self.recordings[0], self.before, self.after, self.times, self._spread(),

@@ -9,7 +9,11 @@ from ._found import Found
 from ._outlook import Outlook
 from ._posterior import Posterior, Weighed
 from ._problem import Problem
+from ._record import Forecast
 from ._weighed import Estimate
+
+# A forecast is far off that leaves the middle of what was read by this many times its range.
+_FAR = 10.0
 
 # What is left beside the findings, by kind of remainder.
 _REMAINDERS = {
@@ -29,6 +33,7 @@ def warnings(
     after: Estimate,
     without: Sequence[Outlook],
     with_: Sequence[Outlook],
+    forecast: Forecast | None,
 ) -> list[str]:
     """What is wrong or to be borne in mind, a sentence each."""
     out, c = [], problem.calibrated
@@ -47,6 +52,8 @@ def warnings(
         out.append("the simulated trajectory diverges: it leaves every bound before the recording ends")
     if not all(o.ok for o in (*without, *with_)):
         out.append("a filter step failed: the trajectory diverges from the recording, or is not finite")
+    if forecast is not None:
+        out += far_off(forecast, recordings[0])
     if not found.complete:
         out.append("the time limit was reached before every combination was weighed")
     for j, name in enumerate(c.names):
@@ -61,4 +68,17 @@ def warnings(
     if odds.tempered < 1:
         out.append(f"evidence was discounted by a factor of {1 / odds.tempered:.1f}: "
                    "the remainder is not white on the scale of the motion")  # fmt: skip
+    return out
+
+
+def far_off(forecast: Forecast, recording: Recording) -> list[str]:
+    """Which expected readings leave what was read by far, from what time on."""
+    out = []
+    for (name, column), read in zip(forecast.columns.items(), recording.readings.T, strict=True):
+        low, high = np.nanmin(read), np.nanmax(read)
+        for label in ("before", "after"):
+            off = np.abs(column[label] - (low + high) / 2) > _FAR * (high - low)
+            if off.any():
+                out.append(f"the forecast of {name} {label} the findings leaves all that was read by more than "
+                           f"{_FAR:g} times its range from t = {forecast.times[off][0]:g} on")  # fmt: skip
     return out
