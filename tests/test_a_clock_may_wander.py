@@ -82,7 +82,9 @@ def test_amplitudes_tell_laws_apart_beside_a_wandering_clock():
     (drag, viscous), (other, worse) = values["clock"], values["coloured"]
     assert drag - viscous > other - worse + 10
     # It names the law; a run goes on from what does not excuse the phase.
-    assert found.shown(laws[0], found.of(laws[0], "clock")) is found.of(laws[0], "coloured")
+    clock = found.of(laws[0], "clock")
+    assert found.shown(laws[0], clock) is found.of(laws[0], "coloured")
+    assert found.told(laws[0], clock) is clock
 
 
 def test_a_clock_that_keeps_time_explains_nothing():

@@ -60,14 +60,21 @@ class Answer:
             self.posterior = posterior(self.problem, found, inflation)
             self.chosen, self.verdict = self._verdict()
         self.before: Estimate = self.posterior.nothing
-        self.after: Estimate = found.shown(self.chosen.combination, self.chosen.best) if self.chosen else self.before
+        self.after, self.run = self._after()
         # Shown before: the calibrated simulation as it is, which knows no missing force.
         plain = found.of((), "white") or self.before
         self.without = self._outlooks(plain, intensity_of(stepper, plain))
-        self.with_ = self._outlooks(self.after, intensity_of(stepper, self.after)) if self.chosen else self.without
+        self.with_ = self._outlooks(self.run, intensity_of(stepper, self.run)) if self.chosen else self.without
         self.pull = self._missing_force()
         self.lens = self._lenses(self.pull or self.before)
         self.lens_after = self._lenses(self.after)
+
+    def _after(self) -> tuple[Estimate, Estimate]:
+        """With the findings: the estimate whose numbers are told, and the one that runs on."""
+        if self.chosen is None:
+            return self.before, self.before
+        answer = self.chosen.combination, self.chosen.best
+        return self.found.told(*answer), self.found.shown(*answer)
 
     def _missing_force(self) -> Estimate | None:
         """The simulation without effects beside a missing force, with outliers taken out where there were some."""
@@ -143,7 +150,7 @@ class Answer:
         p, spread = self.posterior, self._spread()
         rows, other = document.alternatives(self.problem, p, self.verdict, self.chosen)
         before = document.fit(self.problem, self.pull or self.before, self.without, self.recordings, spread)
-        after = document.fit(self.problem, self.after, self.with_, self.recordings, spread) if self.chosen else before
+        after = document.fit(self.problem, self.run, self.with_, self.recordings, spread) if self.chosen else before
         return {
             "schema": "symplearn.diagnosis/1",
             "verdict": self.verdict,
@@ -327,5 +334,5 @@ class Answer:
         """Readings to come, where they were asked for."""
         if self.times is None:
             return None
-        return forecast(self.stepper, self.recordings[0], self.before, self.after, self.times, self._spread(),
+        return forecast(self.stepper, self.recordings[0], self.before, self.run, self.times, self._spread(),
                         self.options.seed)  # fmt: skip

@@ -96,15 +96,17 @@ class Found:
         """The same with the combination's prior: what its probability goes with."""
         return self.best(combination) + self.prices.log(combination)
 
-    def shown(self, combination: Combination, best: Estimate) -> Estimate:
-        """The estimate to run on: where a clear remainder is left, the trajectory fit if that holds on ahead, as wide
-        as its errors are long-lived. A clock that may wander excuses the phase, which a run goes on from; there the
-        best of the others."""
-        others = [one for one in self.estimates[combination] if one.kind != best.kind]
-        if best.kind == "clock" and others:
-            best = speaker(others)
-        white = self.of(combination, "white")
-        one = self.ahead.get(combination)
+    def told(self, combination: Combination, best: Estimate) -> Estimate:
+        """The estimate whose numbers are told: the best one; where a clear remainder is left, the trajectory fit if
+        that holds on ahead, as wide as its errors are long-lived."""
+        white, one = self.of(combination, "white"), self.ahead.get(combination)
         if one is None or not one.holds or white is None or not white.converged:
             return best
         return replace(white, covariance=white.covariance * white.inflation)
+
+    def shown(self, combination: Combination, best: Estimate) -> Estimate:
+        """The estimate to run on: the one that is told. But a clock that may wander excuses the phase, which a run goes
+        on from; there the best of the others."""
+        told = self.told(combination, best)
+        others = [one for one in self.estimates[combination] if one.kind != told.kind]
+        return speaker(others) if told.kind == "clock" and others else told

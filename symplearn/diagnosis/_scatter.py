@@ -164,21 +164,34 @@ def outlier_evidence(
     errors: Float[np.ndarray, "row channel"],
     flagged: Bool[np.ndarray, "row channel"],
 ) -> float:
-    """Log evidence of the suspected readings as outliers, of a share and a size integrated over their priors."""
-    total = 0.0
+    """Log evidence of a noise of two scales, over that of a Gaussian for the readings that are not suspected.
+
+    Share and size of the wider scale are integrated over their priors. Which reading is of which is left open: whoever
+    counts every suspect as wide pays for those that are none.
+    """
+    total, free = 0.0, np.isnan(problem.noise_of(combination))
     for member in combination:
         one = problem.candidate(member)
         if one.effect is OUTLIERS:
-            n, far = int((~np.isnan(errors[:, one.place])).sum()), int(flagged[:, one.place].sum())
-            if far == 0:
+            seen = ~np.isnan(errors[:, one.place])
+            e, off = errors[seen, one.place], flagged[seen, one.place]
+            if not off.any():
                 return -np.inf
-            share = min(far / n, _SHARE)
-            off = errors[flagged[:, one.place], one.place]
-            size = float(np.sqrt(np.mean(off**2)))
-            total += far * np.log(share) + (n - far) * np.log1p(-share) + norm.logpdf(off, scale=size).sum()
-            total += 0.5 * np.log(2 * np.pi * share * (1 - share) / n) - np.log(_SHARE)
-            total += 0.5 * np.log(np.pi / far) + norm.logpdf(0.0, scale=_SIZE)
+            total += _two_scales(e, off, bool(free[one.place])) - norm.logpdf(e[~off]).sum()
     return float(total)
+
+
+def _two_scales(e: Float[np.ndarray, " row"], off: Bool[np.ndarray, " row"], free: bool) -> float:
+    """Log evidence of a noise of two scales by Laplace's method about its best share and size; its core is `free`, or
+    one."""
+    scales = Scales(float(off.mean()), float(np.sqrt(np.mean(e[off] ** 2))))
+    for _ in range(_ROUNDS):
+        scales = scales.refined(e, scales.belongs(e))
+        scales = scales if free else scales._replace(core=1.0)
+    share, n = min(scales.share, _SHARE), len(e)
+    value = scales._replace(share=share).log_likelihood(e)
+    value += 0.5 * np.log(2 * np.pi * share * (1 - share) / n) - np.log(_SHARE)
+    return float(value + 0.5 * np.log(np.pi / max(n * share, 1.0)) + norm.logpdf(0.0, scale=_SIZE))
 
 
 def outliers(errors: Float[np.ndarray, " row"], flagged: Bool[np.ndarray, " row"]) -> tuple[float, float]:
