@@ -105,6 +105,7 @@ def test_damping_of_a_nonseparable_system_is_dissipation():
 FORCED = ("periodic_forcing", "viscous_damping", "linear_stiffness", "sensor_bias")
 
 
+@pytest.mark.slow
 def test_a_periodic_force_is_named_with_its_frequency():
     """A pendulum that something pushes periodically: forcing, with amplitude, frequency and phase."""
     times = np.linspace(0.0, 20.0, 120)

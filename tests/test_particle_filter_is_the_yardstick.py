@@ -128,7 +128,11 @@ def exact_recursion(ys, move, density):
 
 # What the Gaussian approximation may cost on ten readings, in nats. Measured over six recordings: -1.56 to -0.16 with
 # heavy tails, -0.81 to 0.84 with both noises, -0.67 to -0.03 with a factor alone; on the one below -1.44, 0.69, -0.07.
-COSTS = [("student", "added", 1.6), ("gaussian", "multiplied and added", 0.9), ("gaussian", "multiplied", 0.2)]
+COSTS = [
+    pytest.param("student", "added", 1.6, marks=pytest.mark.slow),
+    ("gaussian", "multiplied and added", 0.9),
+    ("gaussian", "multiplied", 0.2),
+]
 
 
 @pytest.mark.parametrize(("move", "read", "cost"), COSTS)
