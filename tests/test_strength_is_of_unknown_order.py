@@ -152,11 +152,22 @@ def test_a_self_excitation_turns_where_the_motion_is(told):
         size = c / (widths * scales[0])
         strength = 2 * np.mean(size**2 * stats.norm.pdf(c, scale=widths * scales[0]))
         a, motion = np.sqrt(c / e), np.sqrt(scales[0] / scales[1])
-        return strength * stats.lognorm.pdf(a, np.log(2), scale=motion) * a / (2 * e)
+        within = (a > 0.4 * motion) / stats.lognorm.sf(0.4, np.log(2))
+        return strength * within * stats.lognorm.pdf(a, np.log(2), scale=motion) * a / (2 * e)
 
     expected = np.log(integral(turning, np.log(1e-4), np.log(0.4)) / integral(independent, np.log(1e-7), np.log(0.4)))
     # The grid of the gain is a twelfth of a standard deviation wide and the density has an edge at c = 0.
     assert turning_gain(centre, spread, scales) == pytest.approx(expected, abs=0.05)
+
+
+def test_what_turns_far_inside_the_motion_is_no_self_excitation():
+    """A damping that grows with the square of the position and drives below a tenth of the swing is impossible as a
+    self-excitation, however well it is known; one that turns at the size of the motion is not."""
+    scales, e = np.array([0.3, 0.5]), 0.1
+    for share, possible in ((0.1, False), (0.8, True)):
+        c = e * share**2 * scales[0] / scales[1]
+        gain = turning_gain(np.array([c, e]), np.diag([0.01 * c, 0.01 * e]) ** 2, scales)
+        assert np.isfinite(gain) == possible
 
 
 def test_what_is_not_known_to_be_a_spread_gains_nothing():

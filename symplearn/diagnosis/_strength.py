@@ -29,6 +29,9 @@ WIDTHS, _SEEN = 7, 4.0
 FAINT_WIDTHS, FAINT = 13, 1e-4
 # Standard deviation of the logarithm of where a self-excitation turns into a damping, about the size of the motion.
 _TURNING = np.log(2.0)
+# Nor is it far below: what turns at less than this share of that size, a quarter of the amplitude of a swing, drives
+# nothing that was recorded, and is a damping.
+_WITHIN = 0.4
 # The grid that integrates over it, in standard deviations of the estimate.
 _REACH, _POINTS = 5.0, 121
 # What the recording says of a direction is at least this share of what the prior says.
@@ -81,9 +84,10 @@ def turning_gain(centre: np.ndarray, spread: np.ndarray, scales: np.ndarray, alo
         return 0.0
     c, e = points[inside].T
     mass = norm.logpdf(normal[inside]).sum(1)
-    a = np.sqrt(c / e)
+    ratio = 0.5 * np.log(c / e * scales[1] / scales[0])
     # Density of e given c: that of ln a, by |d ln a / d e| = 1 / (2 e).
-    turning = norm.logpdf(np.log(a), 0.5 * np.log(scales[0] / scales[1]), _TURNING) - np.log(2 * e)
+    turning = norm.logpdf(ratio, scale=_TURNING) - norm.logsf(np.log(_WITHIN), scale=_TURNING) - np.log(2 * e)
+    turning = np.where(ratio > np.log(_WITHIN), turning, -np.inf)
     each = norm.logpdf(c[:, None], scale=size * scales[0])
     if not alone:
         each = each + 2 * np.log(c[:, None] / (size * scales[0]))
