@@ -45,6 +45,7 @@ def test_a_healthy_oscillator_is_left_in_peace():
     assert abs(k["mean"] - 1.0) < 4 * k["sd"] < 0.1
 
 
+@pytest.mark.slow
 def test_a_bias_of_the_sensor_is_put_on_the_sensor():
     """A pendulum that moves as simulated and is read off by a constant: the place is the sensor, the number right."""
     times = np.linspace(0.0, 12.0, 90)

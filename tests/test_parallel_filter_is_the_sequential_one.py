@@ -59,8 +59,8 @@ def readings(n, channels, missing=()):
 TURN = 0.9 * np.array([[0.8, 0.6], [-0.6, 0.8]])
 CASES = {
     "gaps, inputs and uneven times": Case(
-        TURN, np.array([[1.0, 0.5], [0.0, 1.0]]), np.diag([0.1, 0.4]), readings(37, 2, [0, 3, 4, (9, 1), (36, 0)]),
-        np.eye(2), np.cumsum(RANDOM.uniform(0.5, 2.0, 37)), RANDOM.normal(size=(37, 1)), np.array([[0.0], [1.0]]),
+        TURN, np.array([[1.0, 0.5], [0.0, 1.0]]), np.diag([0.1, 0.4]), readings(13, 2, [0, 3, 4, (9, 1), (12, 0)]),
+        np.eye(2), np.cumsum(RANDOM.uniform(0.5, 2.0, 13)), RANDOM.normal(size=(13, 1)), np.array([[0.0], [1.0]]),
         np.array([[0.3], [-1.0]]),
     ),
 }  # fmt: skip

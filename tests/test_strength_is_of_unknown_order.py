@@ -143,7 +143,7 @@ def test_a_self_excitation_turns_where_the_motion_is(told):
 
     def integral(prior, low, high):
         density = lambda y, x: seen.pdf([x, np.exp(y)]) * prior(x, np.exp(y)) * np.exp(y)  # noqa: E731
-        return integrate.dblquad(density, 0.0, 0.3, low, high, epsabs=0, epsrel=1e-4)[0]
+        return integrate.dblquad(density, 0.0, 0.3, low, high, epsabs=0, epsrel=1e-3)[0]
 
     def independent(c, e):
         return 4 * stats.norm.pdf(c, scale=scales[0]) * stats.norm.pdf(e, scale=scales[1])
