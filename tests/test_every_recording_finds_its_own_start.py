@@ -69,6 +69,7 @@ def test_an_angle_that_nothing_reads_is_not_wound_up(hamiltonian, observe, more,
 ORBITS = ((0.8, -1.3, 0.7, 0.4), (1.0, 0.6, 0.5, -0.8))
 
 
+@pytest.mark.slow
 def test_an_orbit_of_which_one_coordinate_is_read_finds_its_start():
     """Of two ellipses by DOP853 x alone is read, off by 0.01: the best lane begins where they began, or at the mirror
     image on the other side of the x axis, which shows the same."""
