@@ -1,5 +1,7 @@
 """A forecast that leaves everything that was read is said in the warnings; one that stays near is not."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from symplearn._recording import Recording
@@ -21,6 +23,13 @@ def test_the_time_at_which_it_leaves_is_told():
     (said,) = far_off(forecast(np.cos(np.arange(5)), np.exp(2.0 * np.arange(5))), READ)
     # The readings range over almost 2: ten times that is between e^2 and e^4.
     assert "y after the findings" in said and "t = 12 on" in said
+
+
+def test_what_never_moved_or_was_never_read_has_no_range():
+    """A reading that stands still, and one that is missing throughout, are compared with nothing."""
+    for value in (0.0, np.nan):
+        still = replace(READ, readings=np.full((10, 1), value))
+        assert far_off(forecast(np.full(5, 1e-9), np.full(5, 1e-9)), still) == []
 
 
 def test_a_forecast_near_what_was_read_is_not_told():

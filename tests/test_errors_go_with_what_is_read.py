@@ -74,7 +74,7 @@ def test_white_noise_goes_with_nothing():
     """No evidence is gained where the sensor is straight."""
     white, _, positional = evidences(0.0)
     assert positional.log_evidence < white.log_evidence + 1.0
-    # An sd estimated from 400 readings has an error of 3.5 %: three of those.
+    # An sd estimated from 400 readings has an error of 3.5 %: 10 % is three of those.
     assert positional.reading_noise[0] == pytest.approx(NOISE, rel=0.1)
 
 
@@ -87,7 +87,8 @@ def test_averages_share_the_bend():
     (positional,) = weigh_positional(averaged, fits, priors, [len(TIMES)])
     left = averaged.rows[0].readings - fits.predictions[0].readings[0]
     bend = np.sqrt((left**2).mean() - NOISE**2)
-    # The polynomials' own estimate of what is white among 400 rows: 3.5 % of the noise, and less of the bend.
+    # An sd of what is white estimated from 400 rows has an error of 3.5 %, the bend's, which is larger, less: 10 % is
+    # three of those.
     assert positional.noise[0] * np.sqrt(positional.bent[0]) == pytest.approx(bend, rel=0.1)
 
 

@@ -70,8 +70,8 @@ def test_fit_and_held_out_rows_together_are_the_fit_of_all_rows(learnt):
 
 
 def test_held_out_density_knows_that_the_stiffness_is_uncertain(learnt):
-    """The log density of the held-out readings is that of SciPy's predictive Gaussians from the fitted rows, less an
-    error of the stiffness four times as large as it is; with the stiffness taken as known it would be far below."""
+    """The log density of the held-out readings is that of SciPy's predictive Gaussians from the fitted rows, also where
+    the stiffness is said to be ten times as uncertain: then it is 17 nats below that of a stiffness that is known."""
     stepper, estimate, *_ = learnt
     y = stepper.problem.rows[0].readings[:, 0]
     fitted = stepper.problem.rows[0].fitted
@@ -82,11 +82,22 @@ def test_held_out_density_knows_that_the_stiffness_is_uncertain(learnt):
     spread = np.sqrt((slopes**2).sum(0) + NOISE**2)
     expected = norm.logpdf(y[fitted:], swing(mean, late), spread).sum()
     outlook = Outlook(stepper, estimate, 0, np.zeros(1))
-    # The start's own spread is half of it, as the filter has the rows twice: a nat or two over 50 rows.
+    # Start and stiffness together are a third of the noise at most, so that a spread which lacks the half of the
+    # start's that the filter takes off, having the rows twice, is within two nats over 50 rows.
     assert outlook.held_out_log_density(1.0) == pytest.approx(expected, abs=2.0)
     variance = outlook._unsure(16.0)[:, 0]
     at = np.argmax(np.abs(slopes).sum(0))
+    # All of them together have the start's own share, too, which is in the filter's spread here: less than a half.
     assert variance[at] == pytest.approx(16 * (slopes[:, at] ** 2).sum(), rel=0.5)
+    share = swing(mean + covariance[:, 2] / np.sqrt(covariance[2, 2]), late) - swing(mean, late)
+    # The stiffness alone, the start following it: what its curvature makes of four standard deviations is below 2 %.
+    assert variance[at] == pytest.approx(16 * share[at] ** 2, rel=0.02)
+    known, uncertain = (
+        norm.logpdf(y[fitted:], swing(mean, late), np.sqrt(NOISE**2 + k * share**2)).sum() for k in (0, 100)
+    )
+    # The start's own share of a tenth of the noise's variance, which SciPy's leaves out here, is worth a tenth of a
+    # nat.
+    assert outlook.held_out_log_density(100.0) == pytest.approx(uncertain, abs=0.5) and known > uncertain + 15
 
 
 def test_an_outlier_among_them_moves_little():

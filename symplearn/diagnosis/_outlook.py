@@ -102,9 +102,13 @@ class Outlook:
     @cached_property
     def readings(self) -> Float[np.ndarray, "time channel"]:
         """Filtered readings over the fitted rows, then the free run."""
-        last = self.rows.fitted - 1
-        whole = np.concatenate([self.followed[:last], self._run(self.last_state, last)[0]])
+        whole = np.concatenate([self.followed[: self.rows.fitted - 1], self.run])
         return np.where(np.isfinite(whole), whole, np.nan)
+
+    @cached_property
+    def run(self) -> Float[np.ndarray, "row channel"]:
+        """Readings of the free run, from the last fitted row on."""
+        return self._run(self.last_state, self.rows.fitted - 1)[0]
 
     @cached_property
     def followed(self) -> Float[np.ndarray, "fitted channel"]:
@@ -151,11 +155,11 @@ class Outlook:
     def _unsure(self, inflation: float) -> Float[np.ndarray, "held channel"]:
         """Variance of the held-out free run that unknown parameters leave: each of them off by one standard deviation
         in turn, those before it being known and the start following. What diverges then says nothing."""
-        first, variance = self.rows.fitted, np.zeros_like(self.readings[self.rows.fitted :])
+        variance = np.zeros_like(self.run)
         for z in one_off(self.stepper.problem, self.estimate, self.recording, inflation):
-            other = replace(self, estimate=replace(self.estimate, z=z)).readings[first:]
-            variance += np.nan_to_num((other - self.readings[first:]) ** 2, posinf=0.0)
-        return variance
+            other = replace(self, estimate=replace(self.estimate, z=z))
+            variance += np.nan_to_num((other.run - self.run) ** 2, posinf=0.0)
+        return variance[1:]
 
     def _roots(self) -> np.ndarray:
         return row_roots(self.stepper.problem, self.recording, len(self.rows.times), colour_ratio(self.estimate))

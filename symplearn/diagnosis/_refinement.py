@@ -57,9 +57,13 @@ class Refinement:
             mine = [c for c in self._mine() if len(c) == size + base]
             best = max(mine, key=self.found.odds, default=None)
             if best is not None and self.found.odds(best) > max(map(self.found.odds, self._mine())) - _NEAR:
-                starts = [s for s in self.prospects.exchanged(best, MANY, size, _ALIKE) if s.gain > -_BEHIND]
-                if starts:
-                    self.weigher.weigh(starts, whole=True)
+                self.weigh_exchanged(best, size, _ALIKE)
+
+    def weigh_exchanged(self, combination: Combination, size: int, number: int) -> None:
+        """Combinations of a size that may do as well as the best one, from where a regression about it puts them."""
+        starts = [s for s in self.prospects.exchanged(combination, MANY, size, number) if s.gain > -_BEHIND]
+        if starts:  # from a trajectory that all rows are near to
+            self.weigher.weigh(starts, whole=True)
 
     def weigh_subsets(self) -> None:
         """What the best combinations become without each of their members, from where they are: what was weighed

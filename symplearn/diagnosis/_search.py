@@ -48,6 +48,7 @@ class Search:
         self.seeds, self.seed, self.rows = seeds, seeds[0], self.weigher.rows
         self.deadline, self.progress = deadline, progress
         self.prospects = Prospects(self.weigher)
+        self.refinement = Refinement(self.prospects, progress)
 
     @property
     def found(self) -> Found:
@@ -166,7 +167,7 @@ class Search:
         mine = [c for c in dict.fromkeys([self.base, *kept]) if self._is_mine(c)]
         w.weigh([Start(c, white.z, 0.0) for c in mine if (white := before.of(c, "white"))], whole=True)
         if self._in_time():
-            Refinement(self.prospects, self.progress).move_places()
+            self.refinement.move_places()
         w.add_paths(fit_paths(w.stepper, self.null_paths, w.found.priors, self.rows, 3))
         self._weigh_clocks()
         self._weigh_forces()
@@ -200,11 +201,10 @@ class Search:
 
     def _refine(self) -> None:
         """The best once more from elsewhere, with what may do as well, and with what is left without a member."""
-        refinement = Refinement(self.prospects, self.progress)
-        for part in (refinement.move_places, refinement.weigh_like_the_best):
+        for part in (self.refinement.move_places, self.refinement.weigh_like_the_best):
             if self._in_time():
                 part()
-        refinement.weigh_subsets()
+        self.refinement.weigh_subsets()
 
     def _is_mine(self, combination: Combination) -> bool:
         """Whether the outliers that were taken out are part of it."""
@@ -241,14 +241,8 @@ class Search:
             # As many of each: what a score promises about a poor fit is too much.
             self._keep(promised, kept)
             if not k:
-                self._weigh_exchanged(c, size, _PAIRS // _BASES)
+                self.refinement.weigh_exchanged(c, size, _PAIRS // _BASES)
         return sorted(kept.values(), key=lambda start: -start.gain)
-
-    def _weigh_exchanged(self, combination: Combination, size: int, number: int) -> None:
-        """Combinations of a size that may do as well as the best one, from where a regression about it puts them."""
-        starts = [s for s in self.prospects.exchanged(combination, MANY, size, number) if s.gain > -_REACH]
-        if starts:  # from a trajectory that all rows are near to
-            self.weigher.weigh(starts, whole=True)
 
     def _keep(self, listed: Sequence[Start], kept: dict[tuple[Combination, int], Start]) -> None:
         """Add the best of some starts, each combination from two places at most."""
@@ -276,7 +270,7 @@ class Search:
             self.progress(f"weighing {len({s.combination for s in first})} likely effects")
             self.weigher.weigh([self._from_nothing(s.combination) if s.combination in plain else s for s in first])
         if (best := self._adequate()) is not None:
-            self._weigh_exchanged(best, 1, _SMALL)
+            self.refinement.weigh_exchanged(best, 1, _SMALL)
             return
         taken_out = {self._with(c) for c in self.problem.searched if self.problem.candidate(c).effect is OUTLIERS}
         left = plain - taken_out - set(self.found.estimates)

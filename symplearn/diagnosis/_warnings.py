@@ -75,9 +75,11 @@ def far_off(forecast: Forecast, recording: Recording) -> list[str]:
     """Which expected readings leave what was read by far, from what time on."""
     out = []
     for (name, column), read in zip(forecast.columns.items(), recording.readings.T, strict=True):
-        low, high = np.nanmin(read), np.nanmax(read)
+        seen = read[~np.isnan(read)]
+        if not len(seen) or np.ptp(seen) == 0:  # what never moved gives no range to compare with
+            continue
         for label in ("before", "after"):
-            off = np.abs(column[label] - (low + high) / 2) > _FAR * (high - low)
+            off = np.abs(column[label] - (seen.min() + seen.max()) / 2) > _FAR * np.ptp(seen)
             if off.any():
                 out.append(f"the forecast of {name} {label} the findings leaves all that was read by more than "
                            f"{_FAR:g} times its range from t = {forecast.times[off][0]:g} on")  # fmt: skip
