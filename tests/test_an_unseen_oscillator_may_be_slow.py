@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from finding_cases import candidate
 
-from symplearn.diagnosis._effect_priors import Motion, _range
+from symplearn.diagnosis._effect_priors import _range
+from symplearn.diagnosis._motion import Motion
 from symplearn.diagnosis._scan import _places
 
 SPAN, GAP = 12.0, 0.1
 T = np.arange(0.0, SPAN + GAP / 2, GAP)
-MOTION = Motion(np.sin(T)[:, None], np.cos(T)[:, None], np.ones(1), np.ones(1), 0.0, SPAN, GAP)
+MOTION = Motion(np.sin(T)[:, None], np.cos(T)[:, None], np.ones(1), np.ones(1), (T,))
 
 
 @pytest.mark.parametrize(("name", "cycles"), [("hidden_oscillator", 0.5), ("periodic_forcing", 1.0)])

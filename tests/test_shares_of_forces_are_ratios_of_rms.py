@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from finding_cases import VALUES, candidate, said, values
 
-from symplearn.diagnosis._effect_priors import Motion, _unit
+from symplearn.diagnosis._effect_priors import _unit
+from symplearn.diagnosis._motion import Motion
 
 # Theta swings unevenly for ten periods, under forces of a root mean square of 1.7; the forcing has whole periods too.
 T = np.linspace(0.0, 20 * np.pi, 4000, endpoint=False)
 Q = 0.8 * np.sin(T) + 0.3 * np.cos(2 * T) + 0.1
 V = 0.8 * np.cos(T) - 0.6 * np.sin(2 * T)
 PUSH = 1.7
-MOTION = Motion(Q[:, None], V[:, None], np.array([PUSH]), np.ones(1), 0.0, float(T[-1]), float(T[1]))
+MOTION = Motion(Q[:, None], V[:, None], np.array([PUSH]), np.ones(1), (T,))
 c, f, k, a, omega, phi = (VALUES[name] for name in ("c", "f", "k", "a", "omega", "phi"))
 FORCES = {
     "viscous_damping": -c * V,

@@ -1,10 +1,10 @@
 """Trajectory fits of many combinations at once: Levenberg-Marquardt on readings and priors, in a growing window."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from .._effects import HIDDEN
 from ._problem import Combination, Problem
@@ -37,6 +37,8 @@ class Priors:
     lower: Float[np.ndarray, " coefficient"]
     upper: Float[np.ndarray, " coefficient"]
     unseen: Float[np.ndarray, "2"]
+    powers: Float[np.ndarray, "stretch value"] = field(default_factory=lambda: np.zeros((0, 0)))  # see `powers`
+    stretches: Int[np.ndarray, " stretch"] = field(default_factory=lambda: np.zeros(0, int))
 
     def precision_of(self, problem: Problem, combination: Combination) -> Float[np.ndarray, " z"]:
         """Prior precisions with the entries of a combination filled in."""

@@ -1,15 +1,15 @@
 """Priors of every effect's values: the same strength for every effect, along the motion that was recorded."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from .. import _effects as effects
 from .._effects import Candidate, Drag, Oscillating, PowerForce
-from ._along import along_all, force, readings, velocity
+from ._activity import powers
 from ._calibrate import Priors
+from ._motion import Motion, rms
 from ._problem import Problem
 from ._unnamed import Proposal
 
@@ -22,60 +22,6 @@ _DEPTH = 0.005
 _EVEN, _HALF = np.sqrt(3.0), np.sqrt(2.0)
 # A delay is a few samples at most.
 _SAMPLES = 5.0
-
-
-def rms(values: np.ndarray) -> float:
-    """Root mean square of the finite values; 1 where there is none, or none but zeros."""
-    square = values[np.isfinite(values)] ** 2
-    mean = float(np.sqrt(square.mean())) if square.size else 1.0
-    return mean if np.isfinite(mean) and mean > 0 else 1.0
-
-
-def extent(paths: Sequence[Float[np.ndarray, "_ state"]]) -> float:
-    """How far paths lead: the mean logarithm of their columns' root mean squares."""
-    return float(np.mean([np.log(rms(column)) for column in np.concatenate(paths).T]))
-
-
-@dataclass(frozen=True)
-class Motion:
-    """The motion that was recorded, as the simulation without effects follows it; rows of all recordings."""
-
-    q: Float[np.ndarray, "row d"]
-    v: Float[np.ndarray, "row d"]
-    forces: Float[np.ndarray, " d"]  # root mean square
-    spreads: Float[np.ndarray, " channel"]  # standard deviation of the expected readings
-    first: float
-    last: float
-    gap: float  # median time between rows
-
-    @property
-    def span(self) -> float:
-        return self.last - self.first
-
-    @property
-    def frequencies(self) -> tuple[float, float]:
-        """From one cycle in the recording to half the Nyquist frequency, in rad/time."""
-        return 2 * np.pi / self.span, max(np.pi / (2 * self.gap), 2 * np.pi / self.span)
-
-    def own_frequency(self, i: int) -> float:
-        """Typical frequency of one coordinate's motion, in rad/time."""
-        return rms(self.v[:, i]) / rms(self.q[:, i] - np.nanmean(self.q[:, i]))
-
-
-def motion_along(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarray, "_ state"]]) -> Motion:
-    """The motion along given paths."""
-    d = problem.equations.dim
-    v, push, shown = (along_all(problem, what, z, paths) for what in (velocity, force, readings))
-    times = [r.times[: len(path)] for r, path in zip(problem.rows, paths, strict=True)]
-    return Motion(
-        q=np.concatenate([path[:, :d] for path in paths]),
-        v=v[:, :d],
-        forces=np.array([rms(push[:, i]) for i in range(d)]),
-        spreads=np.array([max(float(np.nanstd(column)), 1e-300) for column in shown.T]),
-        first=min(float(t[0]) for t in times),
-        last=max(float(t[-1]) for t in times),
-        gap=float(np.median(np.concatenate([np.diff(t) for t in times]))),
-    )
 
 
 def with_effects(problem: Problem, priors: Priors, motion: Motion) -> Priors:
@@ -95,7 +41,9 @@ def with_effects(problem: Problem, priors: Priors, motion: Motion) -> Priors:
     i = int(np.argmax(motion.forces))
     push = STRENGTH * motion.forces[i]
     unseen = np.array([push, push * motion.own_frequency(i)])
-    return replace(priors, centres=centres, scales=scales, lower=lower, upper=upper, unseen=unseen)
+    fed, stretches = powers(problem, motion)
+    return replace(priors, centres=centres, scales=scales, lower=lower, upper=upper, unseen=unseen, powers=fed,
+                   stretches=stretches)  # fmt: skip
 
 
 def _unit(motion: Motion, one: Candidate) -> tuple[float, ...]:

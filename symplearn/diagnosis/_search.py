@@ -8,8 +8,9 @@ import numpy as np
 
 from .._effects import NOISE, OUTLIERS
 from ._calibrate import Priors
-from ._effect_priors import extent, motion_along, with_effects, with_unnamed
+from ._effect_priors import with_effects, with_unnamed
 from ._found import Found
+from ._motion import extent, motion_along
 from ._noisy import PathFit, fit_paths
 from ._null_paths import beside, null_paths
 from ._problem import MOST, Combination, Problem

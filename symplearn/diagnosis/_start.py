@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ._along import along, along_all, force, readings, velocity
 from ._calibrate import Fits, Priors, calibrate, residuals, weights
-from ._effect_priors import rms
+from ._motion import rms
 from ._problem import Problem
 from ._trajectory import Stepper
 

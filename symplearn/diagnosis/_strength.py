@@ -18,6 +18,7 @@ from scipy.special import log_ndtr, logsumexp
 from scipy.stats import norm
 
 from .._effects import EXCITATION, HIDDEN
+from ._activity import log_fed
 from ._calibrate import Priors
 from ._evidence import log_density, orthants
 from ._problem import Combination, Problem
@@ -44,8 +45,9 @@ def strength_gain(
     problem: Problem, combination: Combination, priors: Priors, z: Float[np.ndarray, " z"],
     covariance: Float[np.ndarray, "z z"],
 ) -> float:  # fmt: skip
-    """Log evidence under unknown orders of magnitude, less that under the widest priors, whose posterior is given."""
-    total, blocks = 0.0, []
+    """Log evidence under unknown orders of magnitude, less that under the widest priors, whose posterior is given; and
+    of a self-excitation what is fed in."""
+    total, blocks = log_fed(problem, combination, priors, z, covariance), []
     alone = sum(problem.candidate(member).effect.amplitudes > 0 for member in combination) == 1
     for member in combination:
         entries = _entries(problem, combination, member)

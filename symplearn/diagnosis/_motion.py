@@ -1,0 +1,73 @@
+"""The motion that was recorded, as the simulation without effects follows it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from ._along import along_all, force, readings, velocity
+from ._problem import Problem
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square of the finite values; 1 where there is none, or none but zeros."""
+    square = values[np.isfinite(values)] ** 2
+    mean = float(np.sqrt(square.mean())) if square.size else 1.0
+    return mean if np.isfinite(mean) and mean > 0 else 1.0
+
+
+def extent(paths: Sequence[Float[np.ndarray, "_ state"]]) -> float:
+    """How far paths lead: the mean logarithm of their columns' root mean squares."""
+    return float(np.mean([np.log(rms(column)) for column in np.concatenate(paths).T]))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The motion that was recorded, as the simulation without effects follows it; rows of all recordings."""
+
+    q: Float[np.ndarray, "row d"]
+    v: Float[np.ndarray, "row d"]
+    forces: Float[np.ndarray, " d"]  # root mean square
+    spreads: Float[np.ndarray, " channel"]  # standard deviation of the expected readings
+    times: tuple[Float[np.ndarray, " _"], ...]  # by recording
+
+    @property
+    def first(self) -> float:
+        return min(float(t[0]) for t in self.times)
+
+    @property
+    def last(self) -> float:
+        return max(float(t[-1]) for t in self.times)
+
+    @property
+    def span(self) -> float:
+        return self.last - self.first
+
+    @cached_property
+    def gap(self) -> float:
+        """Median time between rows."""
+        return float(np.median(np.concatenate([np.diff(t) for t in self.times])))
+
+    @property
+    def frequencies(self) -> tuple[float, float]:
+        """From one cycle in the recording to half the Nyquist frequency, in rad/time."""
+        return 2 * np.pi / self.span, max(np.pi / (2 * self.gap), 2 * np.pi / self.span)
+
+    def own_frequency(self, i: int) -> float:
+        """Typical frequency of one coordinate's motion, in rad/time."""
+        return rms(self.v[:, i]) / rms(self.q[:, i] - np.nanmean(self.q[:, i]))
+
+
+def motion_along(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarray, "_ state"]]) -> Motion:
+    """The motion along given paths."""
+    d = problem.equations.dim
+    v, push, shown = (along_all(problem, what, z, paths) for what in (velocity, force, readings))
+    return Motion(
+        q=np.concatenate([path[:, :d] for path in paths]),
+        v=v[:, :d],
+        forces=np.array([rms(push[:, i]) for i in range(d)]),
+        spreads=np.array([max(float(np.nanstd(column)), 1e-300) for column in shown.T]),
+        times=tuple(r.times[: len(path)] for r, path in zip(problem.rows, paths, strict=True)),
+    )
