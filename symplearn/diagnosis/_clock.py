@@ -78,13 +78,18 @@ def weigh_clock(
     weight = weights(problem, rows)
     errors = residuals(problem, fits.predictions, weight)
     number = sum((w > 0).sum(0) for w in weight)
-    out = []
+    out: list[Estimate] = []
     for b in trusting(problem, fits):
         pieces = [_pieces(problem, fits, [x[b, :, j] for x in errors], weight, b, j) for j in range(problem.channels)]
         both, z = [(colour, replace(colour, ratio=0.0)) for colour in colours[b]], fits.z[b]
+        begins = [both]
+        if out:  # the errors beside another law, too: each search may be caught in an optimum of its own
+            best = max(out, key=lambda one: one.log_evidence)
+            begins.append(list(zip(best.colours, best.clocks, strict=True)))
         for _ in range(_PASSES):  # what is off the path changes what the path is
             off = fits.z[b] - z
-            both = [_fitted(problem, pieces[j], j, both[j], off) for j in range(problem.channels)]
+            both = [_fitted(problem, pieces[j], j, [one[j] for one in begins], off) for j in range(problem.channels)]
+            begins = [both]
             grams, logs = zip(*(_gram_of(problem, *one) for one in zip(pieces, both, strict=True)), strict=True)
             occam = sum(colour.occam + clock.occam for colour, clock in both)
             one = correlated(problem, fits, b, np.stack(grams), np.array(logs), number, occam, priors)
@@ -97,28 +102,46 @@ def _pieces(
     problem: Problem, fits: Fits, errors: Sequence[np.ndarray], weight: Sequence[np.ndarray], b: int, j: int
 ) -> list[_Piece]:
     times = [r.times[: len(w)] for r, w in zip(problem.rows, weight, strict=True)]
-    rates = [np.gradient(p.readings[b, :, j], t) if len(t) > 1 else np.ones(len(t))
-             for p, t in zip(fits.predictions, times, strict=True)]  # fmt: skip
-    size = np.sqrt(np.mean(np.concatenate(rates) ** 2))
+    rates = _rates([p.readings[b, :, j] for p in fits.predictions], times)
     out = []
     for k, x in enumerate(errors):
         w = weight[k][:, j]
         slopes = np.where(w > 0, fits.predictions[k].slopes[b, :, :, j], 0.0)
         columns = np.concatenate([x[None], slopes])
-        out.append(_Piece(columns, np.nan_to_num(rates[k] / (size or 1.0)), w, times[k]))
+        out.append(_Piece(columns, rates[k], w, times[k]))
     return out
 
 
+def _rates(shown: Sequence[np.ndarray], times: Sequence[np.ndarray]) -> list[Float[np.ndarray, " row"]]:
+    """How fast expected readings change, by recording, of a root mean square of one."""
+    rates = [np.gradient(y, t) if len(t) > 1 else np.ones(len(t)) for y, t in zip(shown, times, strict=True)]
+    size = float(np.sqrt(np.mean(np.concatenate(rates) ** 2)))
+    return [np.nan_to_num(rate / (size or 1.0)) for rate in rates]
+
+
+def whitened_beside(
+    columns: Sequence[Float[np.ndarray, "column row"]], shown: Sequence[Float[np.ndarray, " row"]],
+    weight: Sequence[Float[np.ndarray, " row"]], times: Sequence[Float[np.ndarray, " row"]],
+    both: tuple[Colour, Colour],
+) -> list[Float[np.ndarray, "column row"]]:  # fmt: skip
+    """One channel's columns, by recording, whitened beside errors of its sensor and of its clock; `shown` are the
+    expected readings."""
+    pieces = [_Piece(x, rate, w, t) for x, rate, w, t in zip(columns, _rates(shown, times), weight, times, strict=True)]
+    return [_cleared(one, both)[0].T for one in pieces]
+
+
 def _fitted(
-    problem: Problem, pieces: Sequence[_Piece], j: int, before: tuple[Colour, Colour], off: Float[np.ndarray, " z"]
-) -> tuple[Colour, Colour]:
-    """The likeliest error of the sensor and of its clock, each found in turn, then together; sizes are against the
-    white noise, and all unknowns `off` what the columns were taken at."""
+    problem: Problem, pieces: Sequence[_Piece], j: int, begins: Sequence[tuple[Colour, Colour]],
+    off: Float[np.ndarray, " z"],
+) -> tuple[Colour, Colour]:  # fmt: skip
+    """The likeliest error of the sensor and of its clock, each found in turn from the better one of some beginnings,
+    then together; sizes are against the white noise, and all unknowns `off` what the columns were taken at."""
     known = problem.noise[j]
     some = [one.middle(np.append(1.0, off[problem.local(k)])) for k, one in enumerate(pieces)]
     grid = grid_of([one.times for one in pieces], _DAMPINGS, _TIMES)
     largest = REMAINDER * float(np.nanstd(np.concatenate([r.readings[:, j] for r in problem.rows])))
-    both = list(before)
+    first = _values(some, np.array([[_shape(one) for one in both] for both in begins]), known, largest)
+    both = list(begins[int(np.argmax(first))])
     for turn in range(_TURNS):
         searched = 1 - turn % 2
         tried = np.append(grid, [_shape(both[searched])], axis=0)

@@ -7,6 +7,7 @@ from scipy.stats import norm, truncnorm
 
 from .._effects import NOISE, Candidate
 from ._calibrate import Priors
+from ._found import within_signs
 from ._problem import Problem
 from ._weighed import Estimate, Mode
 
@@ -37,6 +38,8 @@ def coefficients(
         return {one.effect.coefficients[0]: _single(problem, estimate, place.start, inflation)}
     draws = _drawn(problem, priors, estimate, place, inflation)
     named = one.effect.named(draws, problem.equations.origin)
+    if within_signs(problem, estimate) is not estimate:  # a step about a fit may end beyond
+        values |= {name: float(np.median(named[name])) for name in values if name != "phi"}
     return {name: _summary(values[name], named[name], circular=name == "phi") for name in values}
 
 

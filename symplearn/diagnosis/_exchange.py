@@ -19,6 +19,7 @@ from ._scan import layout, packed
 from ._score import Start, Unit, inverse
 from ._strength import mixture_gain
 from ._trajectory import LANES, Stepper
+from ._whitening import Whiten
 
 # Effects that triples are formed of, and subsets of which every order of magnitude is weighed.
 _THREES, _WEIGHED = 24, 60
@@ -46,9 +47,13 @@ class Subset:
 
 
 class Regression:
-    """The readings' errors and the responses to effects, initial states and calibrated values projected out."""
+    """The readings' errors and the responses to effects, initial states and calibrated values projected out; by the
+    noise, or whitened as a remainder has them."""
 
-    def __init__(self, stepper: Stepper, fits: Fits, rows: Sequence[int], priors: Priors, units: dict[int, Unit]):
+    def __init__(
+        self, stepper: Stepper, fits: Fits, rows: Sequence[int], priors: Priors, units: dict[int, Unit],
+        whiten: Whiten | None = None,
+    ):  # fmt: skip
         self.problem, self.priors = stepper.problem, priors
         (self.combination,), (self.z,) = fits.combinations, fits.z
         error, others = by_the_noise(self.problem, fits, rows)
@@ -64,18 +69,19 @@ class Regression:
         self.width = np.concatenate([[1.0], *widths])
         sizes = [one.values[:n] for one, n in zip(self.responses, numbers, strict=True)]
         self.error = np.concatenate([[1.0], *sizes])  # the error without any effect, as a sum of columns
-        self._project(error, others, [one.columns for one in self.responses])
+        some = np.concatenate([error[None], *(one.columns for one in self.responses)])
+        self._project(*((some, others) if whiten is None else (whiten(some), whiten(others))))
 
     def _is_unseen(self, member: int) -> bool:
         return self.problem.candidate(member).effect is HIDDEN
 
-    def _project(self, error: np.ndarray, others: np.ndarray, columns: Sequence[np.ndarray]) -> None:
+    def _project(self, some: np.ndarray, others: np.ndarray) -> None:
         """The Gram matrix of the error and of all amplitudes, and how the other unknowns follow each of them."""
         p = self.problem
         free = np.nonzero(p.active(self.combination)[: p.slots])[0]
         precision = self.priors.precision_of(p, self.combination)[free]
         off = (self.priors.mean_of(p, self.combination) - self.z)[free]
-        some, moved = np.concatenate([error[None], *columns]), others[free]
+        moved = others[free]
         cross, square = moved @ some.T, moved @ moved.T + np.diag(precision)
         cross[:, 0] += precision * off
         self.free, self.follow = free, inverse(square) @ cross

@@ -32,6 +32,18 @@ def speaker(estimates: Sequence[Estimate]) -> Estimate:
     return max(estimates, key=lambda e: e.log_evidence - (0.0 if e.converged else _UNCONVERGED))
 
 
+def within_signs(problem: Problem, estimate: Estimate) -> Estimate:
+    """The most probable one of those that signs allow: a step about a fit may end beyond, where no friction is."""
+    bounds = problem.lower_bounds(estimate.combination)
+    z, spread, held = estimate.z, estimate.covariance, list[int]()
+    while beyond := [k for k, low in bounds.items() if k not in held and z[k] < low]:
+        held += beyond
+        missing = np.array([bounds[k] for k in held]) - estimate.z[held]
+        z = estimate.z + spread[:, held] @ np.linalg.lstsq(spread[np.ix_(held, held)], missing)[0]
+        z[held] = [bounds[k] for k in held]
+    return estimate if z is estimate.z else replace(estimate, z=z)
+
+
 @dataclass
 class Found:
     """Estimates by combination, one per kind of remainder; where the places of its effects have several optima, they
@@ -105,8 +117,8 @@ class Found:
         return replace(white, covariance=white.covariance * white.inflation)
 
     def shown(self, combination: Combination, best: Estimate) -> Estimate:
-        """The estimate to run on: the one that is told. But a clock that may wander excuses the phase, which a run goes
-        on from; there the best of the others."""
+        """The estimate to run on: the one that is told, where signs allow it. But a clock that may wander excuses the
+        phase, which a run goes on from; there the best of the others."""
         told = self.told(combination, best)
         others = [one for one in self.estimates[combination] if one.kind != told.kind]
-        return speaker(others) if told.kind == "clock" and others else told
+        return within_signs(self.problem, speaker(others) if told.kind == "clock" and others else told)

@@ -83,17 +83,37 @@ def _channel(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int) 
     weight = weights(problem, rows)
     expected = np.concatenate([p.readings[b, :, j] for p in fits.predictions])
     seen = np.concatenate([w[:, j] > 0 for w in weight])
-    low, high = expected[seen].min(initial=0.0), expected[seen].max(initial=1.0)
-    place = np.clip(2 * (expected - low) / max(high - low, 1e-300) - 1, -1.0, 1.0)
-    shapes = legvander(np.nan_to_num(place), _DEGREE) * np.sqrt(2 * np.arange(_DEGREE + 1) + 1)
-    parts = []
+    shapes, parts = _polynomials(expected, seen), []
     for r, (x, w) in enumerate(zip(residuals(problem, fits.predictions, weight), weight, strict=True)):
         slopes = np.zeros((problem.size, len(w)))
         slopes[problem.local(r)] = fits.predictions[r].slopes[b, :, :, j]
         parts.append(np.concatenate([x[b, None, :, j], slopes]))
     root = np.sqrt(np.concatenate([w[:, j] for w in weight]))
-    columns = np.where(seen, np.concatenate([np.concatenate(parts, axis=1), shapes.T]), 0.0) * root
+    columns = np.where(seen, np.concatenate([np.concatenate(parts, axis=1), shapes]), 0.0) * root
     return _Channel(columns, 1 + problem.size, seen, float(2 * np.log(root[seen]).sum()))
+
+
+def _polynomials(expected: Float[np.ndarray, " row"], seen: Bool[np.ndarray, " row"]) -> np.ndarray:
+    """Orthonormal over the range of what is read. Shape (degree + 1, row)."""
+    low, high = expected[seen].min(initial=0.0), expected[seen].max(initial=1.0)
+    place = np.clip(2 * (expected - low) / max(high - low, 1e-300) - 1, -1.0, 1.0)
+    shapes: np.ndarray = legvander(np.nan_to_num(place), _DEGREE) * np.sqrt(2 * np.arange(_DEGREE + 1) + 1)
+    return shapes.T
+
+
+def whitened_along(
+    columns: Sequence[Float[np.ndarray, "column row"]], shown: Sequence[Float[np.ndarray, " row"]],
+    weight: Sequence[Float[np.ndarray, " row"]], ratio: float,
+) -> list[Float[np.ndarray, "column row"]]:  # fmt: skip
+    """One channel's columns, by recording, whitened beside an error that goes with what is read: the noise's variance
+    and that of `ratio` times its size together. `shown` are the expected readings."""
+    w, every = np.concatenate(weight), np.concatenate(columns, axis=1)
+    rest = np.where(w > 0, _polynomials(np.concatenate(shown), w > 0), 0.0) * np.sqrt(w)
+    _, sizes, ways = np.linalg.svd(rest, full_matrices=False)
+    less = 1.0 - 1.0 / np.sqrt(1.0 + ratio / len(rest) * sizes**2)
+    every = every * np.sqrt(w)
+    done = every - (every @ ways.T * less) @ ways
+    return np.split(done, np.cumsum([len(one) for one in weight])[:-1], axis=1)
 
 
 def _ratio(problem: Problem, one: _Channel, j: int, known: float) -> tuple[float, float]:

@@ -14,6 +14,7 @@ from ._score import Start, Unit
 from ._tangent import sharp_units
 from ._weighed import Estimate
 from ._weigher import Weigher
+from ._whitening import whitening
 
 # Places at which an effect is tried beside the best of a size.
 MANY = 160
@@ -54,9 +55,12 @@ class Prospects:
         grams = on_path(w.stepper, path, w.rows)
         return scan(w.problem, grams, path.z, w.base, w.found.priors, self._units(most))
 
-    def exchanged(self, combination: Combination, most: int, size: int, number: int) -> list[Start]:
+    def exchanged(
+        self, combination: Combination, most: int, size: int, number: int, beside: Estimate | None = None
+    ) -> list[Start]:
         """Combinations of a size, at most so many, that may do as well as a fitted one, whose members they need not
-        have: of all effects without a place, and of others where one more of them helps most."""
+        have: of all effects without a place, and of others where one more of them helps most. `beside` the remainder
+        of an estimate, if any: those too that were weighed without it."""
         w, fits = self.weigher, self._fitted(combination)
         if fits is None:
             return []
@@ -71,8 +75,10 @@ class Prospects:
                 and problem.candidate(m).effect is not HIDDEN}  # fmt: skip
         if not some:
             return []
-        regression = Regression(w.stepper, fits, w.rows, w.found.priors, some)
-        return regression.subsets(size + len(w.base), w.found.estimates.__contains__, number)
+        whiten = whitening(problem, fits, w.rows, beside) if beside else None
+        regression = Regression(w.stepper, fits, w.rows, w.found.priors, some, whiten)
+        known = [c for c in w.found.estimates if beside is None or w.found.of(c, beside.kind)]
+        return regression.subsets(size + len(w.base), set(known).__contains__, number)
 
     def _scanned(self, fits: Fits, most: int) -> list[Start]:
         w, (combination,), (z,) = self.weigher, fits.combinations, fits.z

@@ -4,7 +4,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ._found import Found
+from .._effects import HIDDEN
+from ._found import Found, speaker
 from ._problem import MOST, Combination, Problem
 from ._prospects import MANY, Prospects
 from ._scan import spacing
@@ -64,6 +65,34 @@ class Refinement:
         starts = [s for s in self.prospects.exchanged(combination, MANY, size, number) if s.gain > -_BEHIND]
         if starts:  # from a trajectory that all rows are near to
             self.weigher.weigh(starts, whole=True)
+
+    def weigh_beside_the_remainder(self) -> None:
+        """What may do as well as the likeliest of every size beside the remainder that the best answer leaves: a search
+        under white noise looks for what takes a part of it."""
+        ranked = sorted(self._mine(), key=self.found.odds, reverse=True)
+        top, rest = self.found.odds(ranked[0]), speaker(self.found.estimates[ranked[0]])
+        if rest.kind in ("white", "force"):
+            return
+        self.progress("weighing what may do as well beside the remainder")
+        some: dict[Combination, Start] = {}
+        for c in self._bases([c for c in ranked if self.found.odds(c) > top - _BEHIND]):
+            least = top - self.found.odds(c) - 2 * _NEAR
+            for size in range(len(c), min(len(c) + 1, MOST) + 1):
+                alike = self.prospects.exchanged(c, MANY, size - len(self.weigher.base), _ALIKE, rest)
+                some |= {start.combination: start for start in alike if start.gain > least}
+        if new := [start for c, start in some.items() if c not in self.found.estimates]:
+            self.weigher.weigh(new, whole=True)
+        if rest.kind == "clock" and some:
+            self.weigher.weigh_clocks(list(some))
+
+    def _bases(self, ranked: Sequence[Combination]) -> list[Combination]:
+        """The best of every size, and the best without an unseen oscillator, which no exchange takes out."""
+        found = []
+        for size in range(1, MOST + 1):
+            mine = [c for c in ranked if len(c) == size and c != self.weigher.base]
+            seen = [c for c in mine if all(self.problem.candidate(m).effect is not HIDDEN for m in c)]
+            found += [*mine[:1], *seen[:1]]
+        return list(dict.fromkeys(found))
 
     def weigh_subsets(self) -> None:
         """What the best combinations become without each of their members, from where they are: what was weighed

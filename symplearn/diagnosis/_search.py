@@ -34,6 +34,8 @@ _SMALL, _ALIKE = 24, 4
 _FORCED = 6
 # Combinations that are fitted between two looks at the clock.
 _BATCH = 24
+# Of each size, combinations whose clock may wander, however far behind.
+_SIMPLE = 2
 # Combinations that are weighed again in finer steps.
 _AGAIN = 24
 # Places at which an effect is tried beside others than the best of the size below.
@@ -84,6 +86,8 @@ class Search:
                 break
         self._refine()
         self._weigh_clocks()
+        if self._in_time():
+            self.refinement.weigh_beside_the_remainder()
         self.progress("weighing missing forces beside the best combinations")
         self._weigh_forces()
         self.weigher.weigh_with_outliers_in()
@@ -338,7 +342,9 @@ class Search:
         if white is None or white.log_evidence < top:
             self.progress("weighing errors of the clock")
             near = [c for c in ranked if self.found.best(c) > top - _REACH][:KEPT]
-            self.weigher.weigh_clocks(list(dict.fromkeys([*near, self.base])))
+            # What a clock excuses may be all that a larger one has ahead of the best of its size.
+            few = [c for size in range(1, MOST) for c in [c for c in ranked if self._size(c) == size][:_SIMPLE]]
+            self.weigher.weigh_clocks(list(dict.fromkeys([*near, self.base, *few])))
 
     def _weigh_forces(self) -> None:
         """Best combinations again, each with a missing force beside it; only the very best where that needs none."""

@@ -1,0 +1,51 @@
+"""Readings' errors and slopes whitened as an estimate takes their remainder: what is regressed on beside it."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from ._calibrate import Fits, weights
+from ._clock import whitened_beside
+from ._coloured import whitened_series
+from ._positional import whitened_along
+from ._problem import Problem
+from ._weighed import Estimate
+
+# Columns of all readings by the noise of a fit of one lane, recordings end to end (as `by_the_noise` gives them).
+Whiten = Callable[[Float[np.ndarray, "column reading"]], Float[np.ndarray, "column reading"]]
+
+
+def whitening(problem: Problem, fits: Fits, rows: Sequence[int], estimate: Estimate) -> Whiten | None:
+    """What whitens the readings of a fit of one lane, and counts them by the noise that is left of the remainder that
+    an estimate has; None for one without."""
+    if estimate.kind not in ("coloured", "clock", "positional"):
+        return None
+    weight = weights(problem, rows)
+    scale = fits.noise[0] / estimate.noise
+
+    def whiten(columns: Float[np.ndarray, "column reading"]) -> Float[np.ndarray, "column reading"]:
+        ends = np.cumsum([0, *(w.size for w in weight)])
+        parts = [columns[:, a:b].reshape(len(columns), *w.shape) * scale
+                 for a, b, w in zip(ends[:-1], ends[1:], weight, strict=True)]  # fmt: skip
+        for j in range(problem.channels):
+            own = [np.where(w[:, j] > 0, part[..., j] / np.sqrt(np.where(w[:, j] > 0, w[:, j], 1.0)), 0.0)
+                   for part, w in zip(parts, weight, strict=True)]  # fmt: skip
+            for part, x in zip(parts, _channel(problem, fits, weight, estimate, j, own), strict=True):
+                part[..., j] = x
+        return np.concatenate([part.reshape(len(columns), -1) for part in parts], axis=1)
+
+    return whiten
+
+
+def _channel(
+    problem: Problem, fits: Fits, weight: Sequence[np.ndarray], estimate: Estimate, j: int, columns: list[np.ndarray]
+) -> list[Float[np.ndarray, "column row"]]:
+    """One channel's columns, by recording, each in units of one reading's noise."""
+    own, shown = [w[:, j] for w in weight], [p.readings[0, :, j] for p in fits.predictions]
+    times = [r.times[: len(w)] for r, w in zip(problem.rows, weight, strict=True)]
+    if estimate.kind == "coloured":
+        return [whitened_series(x, w, t, estimate.colours[j]).T for x, w, t in zip(columns, own, times, strict=True)]
+    if estimate.kind == "clock":
+        return whitened_beside(columns, shown, own, times, (estimate.colours[j], estimate.clocks[j]))
+    return whitened_along(columns, shown, own, estimate.bent[j])
