@@ -32,18 +32,19 @@ def test_polynomials_are_integrated_out(ratio):
     np.testing.assert_allclose(columns[:4] @ one.cleared(ratio).T, gram, rtol=1e-9)
 
 
-def fitted(scale, errors=None, given=0.0):
+def fitted(scale, errors=None, given=0.0, size=1.0, zero=0.0):
     """A spring, its stiffness calibrated, whose reading a sensor bends by `scale`, fitted; its noise is `given`, and
-    said to be wrong, or not."""
+    said to be wrong, or not. It is read in units of `size` from `zero` on."""
     rates = lambda t, x: [x[1], -x[0] - 0.01 * x[1]]  # noqa: E731
     q = cases.solved(rates, [1.0, 0.0], TIMES)[:, 0]
     errors = np.random.default_rng(2).normal(size=len(q)) if errors is None else errors
-    y = q + scale * (3 * q**2 - 2 * q**4) + NOISE * errors
+    y = zero + size * (q + scale * (3 * q**2 - 2 * q**4) + NOISE * errors)
     more = (
         '[parameters]\nk = { value = 1.0, sd = 0.1 }\n[[terms]]\neffect = "viscous_damping"\ntarget = "q"\nc = 0.01\n'
     )
     more += f"[recording.noise]\ny = {given}\n" if given else ""
-    p = cases.problem(cases.simulation("p**2/2 + k*q**2/2", more=more), [cases.recorded(TIMES, y)], 0.05)
+    file = cases.simulation("p**2/2 + k*q**2/2", observe={"y": f"{zero} + {size}*q"}, more=more)
+    p = cases.problem(file, [cases.recorded(TIMES, y)], 0.05)
     priors = replace(priors_without_effects(p), precision=np.full(p.size, 1e-2))
     begin = np.zeros(p.size)
     begin[[0, p.head]] = 1.0
@@ -53,9 +54,9 @@ def fitted(scale, errors=None, given=0.0):
     return p, fits, priors
 
 
-def evidences(scale, errors=None):
+def evidences(scale, errors=None, **read):
     """Estimates by remainder."""
-    p, fits, priors = fitted(scale, errors)
+    p, fits, priors = fitted(scale, errors, **read)
     kinds = (weigh_white, weigh_coloured, weigh_positional)
     return [weigh(p, fits, priors, [len(TIMES)])[0] for weigh in kinds]
 
@@ -68,6 +69,14 @@ def test_a_bent_scale_is_seen_as_one():
     assert positional.log_evidence > coloured.log_evidence + 10 > white.log_evidence + 20
     assert NOISE < positional.reading_noise[0] < 0.05  # the bend alone has an rms of 0.024
     assert positional.inflation < white.inflation
+
+
+@pytest.mark.parametrize(("size", "zero"), [(0.02, 0.0), (1.0, 50.0), (30.0, -7.0)])
+def test_it_is_seen_wherever_and_in_whatever_unit_it_is_read(size, zero):
+    """A bent scale gains as much on white noise where the readings are small, large, or far from zero."""
+    (white, _, bent), (plain, _, same) = evidences(0.03), evidences(0.03, size=size, zero=zero)
+    # The fits stop where they promise less than half a nat, each on its own way.
+    assert same.log_evidence - plain.log_evidence == pytest.approx(bent.log_evidence - white.log_evidence, abs=1.0)
 
 
 def test_white_noise_goes_with_nothing():

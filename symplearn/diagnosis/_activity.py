@@ -57,7 +57,7 @@ def log_fed(
     """Log probability that every self-excitation of a combination feeds in more than it and the frictions of its
     coordinate take out, somewhere in the recordings; zero without any."""
     ones = [m for m in combination if problem.candidate(m).effect is EXCITATION]
-    return sum(_log_fed(problem, combination, m, priors, z, covariance) for m in ones)
+    return float(sum(_log_fed(problem, combination, m, priors, z, covariance) for m in ones))
 
 
 def _log_fed(problem: Problem, combination: Combination, member: int, priors: Priors, z, covariance) -> float:

@@ -112,7 +112,7 @@ def _pieces(
     return out
 
 
-def _rates(shown: Sequence[np.ndarray], times: Sequence[np.ndarray]) -> list[Float[np.ndarray, " row"]]:
+def _rates(shown: Sequence[np.ndarray], times: Sequence[np.ndarray]) -> list[Float[np.ndarray, " _"]]:
     """How fast expected readings change, by recording, of a root mean square of one."""
     rates = [np.gradient(y, t) if len(t) > 1 else np.ones(len(t)) for y, t in zip(shown, times, strict=True)]
     size = float(np.sqrt(np.mean(np.concatenate(rates) ** 2)))
@@ -120,10 +120,10 @@ def _rates(shown: Sequence[np.ndarray], times: Sequence[np.ndarray]) -> list[Flo
 
 
 def whitened_beside(
-    columns: Sequence[Float[np.ndarray, "column row"]], shown: Sequence[Float[np.ndarray, " row"]],
-    weight: Sequence[Float[np.ndarray, " row"]], times: Sequence[Float[np.ndarray, " row"]],
+    columns: Sequence[Float[np.ndarray, "column _"]], shown: Sequence[Float[np.ndarray, " _"]],
+    weight: Sequence[Float[np.ndarray, " _"]], times: Sequence[Float[np.ndarray, " _"]],
     both: tuple[Colour, Colour],
-) -> list[Float[np.ndarray, "column row"]]:  # fmt: skip
+) -> list[Float[np.ndarray, "column _"]]:  # fmt: skip
     """One channel's columns, by recording, whitened beside errors of its sensor and of its clock; `shown` are the
     expected readings."""
     pieces = [_Piece(x, rate, w, t) for x, rate, w, t in zip(columns, _rates(shown, times), weight, times, strict=True)]

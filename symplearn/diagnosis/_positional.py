@@ -95,16 +95,16 @@ def _channel(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int) 
 
 def _polynomials(expected: Float[np.ndarray, " row"], seen: Bool[np.ndarray, " row"]) -> np.ndarray:
     """Orthonormal over the range of what is read. Shape (degree + 1, row)."""
-    low, high = expected[seen].min(initial=0.0), expected[seen].max(initial=1.0)
-    place = np.clip(2 * (expected - low) / max(high - low, 1e-300) - 1, -1.0, 1.0)
+    some = expected[seen] if seen.any() else np.zeros(1)
+    place = np.clip(2 * (expected - some.min()) / max(np.ptp(some), 1e-300) - 1, -1.0, 1.0)
     shapes: np.ndarray = legvander(np.nan_to_num(place), _DEGREE) * np.sqrt(2 * np.arange(_DEGREE + 1) + 1)
     return shapes.T
 
 
 def whitened_along(
-    columns: Sequence[Float[np.ndarray, "column row"]], shown: Sequence[Float[np.ndarray, " row"]],
-    weight: Sequence[Float[np.ndarray, " row"]], ratio: float,
-) -> list[Float[np.ndarray, "column row"]]:  # fmt: skip
+    columns: Sequence[Float[np.ndarray, "column _"]], shown: Sequence[Float[np.ndarray, " _"]],
+    weight: Sequence[Float[np.ndarray, " _"]], ratio: float,
+) -> list[Float[np.ndarray, "column _"]]:  # fmt: skip
     """One channel's columns, by recording, whitened beside an error that goes with what is read: the noise's variance
     and that of `ratio` times its size together. `shown` are the expected readings."""
     w, every = np.concatenate(weight), np.concatenate(columns, axis=1)

@@ -40,7 +40,7 @@ def whitening(problem: Problem, fits: Fits, rows: Sequence[int], estimate: Estim
 
 def _channel(
     problem: Problem, fits: Fits, weight: Sequence[np.ndarray], estimate: Estimate, j: int, columns: list[np.ndarray]
-) -> list[Float[np.ndarray, "column row"]]:
+) -> list[Float[np.ndarray, "column _"]]:
     """One channel's columns, by recording, each in units of one reading's noise."""
     own, shown = [w[:, j] for w in weight], [p.readings[0, :, j] for p in fits.predictions]
     times = [r.times[: len(w)] for r, w in zip(problem.rows, weight, strict=True)]

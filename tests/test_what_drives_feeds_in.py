@@ -1,0 +1,87 @@
+"""A self-excitation is named only where more energy is fed in than is lost, at some time in the recordings."""
+
+import engine_cases as cases
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from symplearn.diagnosis._activity import log_fed
+from symplearn.diagnosis._effect_priors import with_effects
+from symplearn.diagnosis._motion import motion_along
+from symplearn.diagnosis._problem import MOST
+from symplearn.diagnosis._start import priors_without_effects
+
+TIMES, RATE = np.linspace(0.0, 62.8, 1257), 0.05
+# A swing that dies: its amplitude falls from 1 to a twenty-third.
+SWING = np.exp(-RATE * TIMES) * np.cos(TIMES)
+SPEED = np.gradient(SWING, TIMES)
+
+
+@pytest.fixture(scope="module")
+def known():
+    p = cases.problem(cases.simulation("p**2/2 + q**2/2"), [cases.recorded(TIMES, SWING)], 0.05)
+    z = np.zeros(p.size)
+    still = np.zeros_like(TIMES)  # of the unseen oscillator, which there is none of
+    motion = motion_along(p, z, [np.stack([SWING, still, SPEED, still], axis=1)])
+    return p, with_effects(p, priors_without_effects(p), motion)
+
+
+def combined(p, values):
+    """A combination of effects with their amplitudes inside."""
+    names = {p.candidate(m).effect.name: m for m in p.searched}
+    members = sorted((names[name], name) for name in values)
+    c, z = tuple(m for m, _ in members), np.zeros(p.size)
+    for (_, place), (_, name) in zip(p.placed(c), members, strict=True):
+        z[place][: len(values[name])] = values[name]
+    assert len(c) <= MOST
+    return c, z
+
+
+def surplus(values, rows=slice(None)):
+    """Mean power over some rows, from each effect's force as the contract has it."""
+    c, e = values["self_excitation"]
+    force = c * SPEED - e * SWING**2 * SPEED
+    force -= values.get("viscous_damping", [0])[0] * SPEED
+    force -= values.get("quadratic_drag", [0])[0] * np.abs(SPEED) * SPEED
+    force -= values.get("coulomb_friction", [0])[0] * np.sign(SPEED)
+    return (force * SPEED)[rows].mean()
+
+
+CASES = {
+    "it drives the small motion": ({"self_excitation": [0.05, 0.5]}, True),
+    "it turns below the smallest motion": ({"self_excitation": [0.0001, 0.5]}, False),
+    "a friction takes more everywhere": ({"self_excitation": [0.1, 0.1], "coulomb_friction": [0.2]}, False),
+    "a drag takes more where it is fast only": ({"self_excitation": [0.1, 0.1], "quadratic_drag": [0.5]}, True),
+    "a damping takes all of it": ({"self_excitation": [0.1, 0.1], "viscous_damping": [0.12]}, False),
+}
+
+
+@pytest.mark.parametrize(("values", "drives"), CASES.values(), ids=CASES)
+def test_what_loses_more_than_it_feeds_is_impossible(values, drives, known):
+    """However well its coefficients are known, and whatever is ahead in the fit; where it feeds in at some time, it
+    owes nothing."""
+    p, priors = known
+    c, z = combined(p, values)
+    found = log_fed(p, c, priors, z, np.diag(np.full(p.size, 1e-6) ** 2))
+    thirds = [surplus(values, part) for part in np.array_split(np.arange(len(TIMES)), 10)]
+    assert drives == (max(thirds) > 0) and (found == pytest.approx(0.0, abs=1e-6)) == drives
+    assert drives or found < -100
+
+
+def test_what_is_uncertain_is_weighed_by_its_probability(known):
+    """Where the damping's error is as large as what it takes too much: SciPy's normal distribution, in the stretch of
+    a swing each where most is fed in."""
+    p, priors = known
+    c, z = combined(p, {"self_excitation": [0.1, 0.0], "viscous_damping": [0.12]})
+    spread = np.zeros((p.size, p.size))
+    place = next(place for m, place in p.placed(c) if p.candidate(m).effect.name == "viscous_damping")
+    spread[place, place] = 0.02**2
+    # Both go with the speed's square, so that one more standard deviation of the damping balances them at any time.
+    assert log_fed(p, c, priors, z, spread) == pytest.approx(norm.logcdf(-1.0), abs=1e-9)
+
+
+def test_without_a_self_excitation_nothing_is_owed(known):
+    """Dampings alone may only lose."""
+    p, priors = known
+    c, z = combined(p, {"coulomb_friction": [0.2], "viscous_damping": [0.1]})
+    assert log_fed(p, c, priors, z, np.eye(p.size)) == 0.0
