@@ -5,11 +5,13 @@ from dataclasses import replace
 import engine_cases as cases
 import numpy as np
 import pytest
+from numpy.polynomial import Legendre
 from scipy.stats import norm, t
 
 from symplearn import _effects as effects
 from symplearn.diagnosis._calibrate import calibrate
 from symplearn.diagnosis._clock import weigh_clock
+from symplearn.diagnosis._outlook import Outlook
 from symplearn.diagnosis._positional import _Channel, weigh_positional
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
@@ -32,9 +34,24 @@ def test_polynomials_are_integrated_out(ratio):
     np.testing.assert_allclose(columns[:4] @ one.cleared(ratio).T, gram, rtol=1e-9)
 
 
-def fitted(scale, errors=None, given=0.0, size=1.0, zero=0.0):
+@pytest.mark.parametrize("ratio", [0.05, 30.0])
+def test_the_error_is_what_a_dense_process_expects(ratio):
+    """Its mean, and the rms of what is left of its sd, are those of Gaussian process regression on the same errors."""
+    rng = np.random.default_rng(1)
+    seen, root = rng.uniform(-2.0, 3.0, 50), np.sqrt(rng.uniform(0.5, 20.0, 50))
+    shapes = np.stack([np.sqrt(2 * k + 1) * Legendre.basis(k)(2 * (seen + 2) / 5 - 1) for k in range(13)])
+    columns, column = rng.normal(size=(4, 50)) * root, rng.normal(size=4)
+    one = _Channel(np.concatenate([columns, shapes * root]), 4, np.ones(50, bool), 0.7, (-2.0, 3.0))
+    found, prior = one.bend(column, ratio, 0.3), ratio / 13 * shapes.T @ shapes
+    taken = prior @ np.linalg.inv(prior + np.diag(1 / root**2))
+    np.testing.assert_allclose(found(seen), taken @ (column @ columns / root), rtol=1e-9)
+    left = np.average(np.diag(prior - taken @ prior), weights=root**2)
+    assert found.spread == pytest.approx(0.3 * np.sqrt(left), rel=1e-9)
+
+
+def fitted(scale, errors=None, given=0.0, size=1.0, zero=0.0, hold=0.0):
     """A spring, its stiffness calibrated, whose reading a sensor bends by `scale`, fitted; its noise is `given`, and
-    said to be wrong, or not. It is read in units of `size` from `zero` on."""
+    said to be wrong, or not. It is read in units of `size` from `zero` on; a share is held out."""
     rates = lambda t, x: [x[1], -x[0] - 0.01 * x[1]]  # noqa: E731
     q = cases.solved(rates, [1.0, 0.0], TIMES)[:, 0]
     errors = np.random.default_rng(2).normal(size=len(q)) if errors is None else errors
@@ -44,12 +61,12 @@ def fitted(scale, errors=None, given=0.0, size=1.0, zero=0.0):
     )
     more += f"[recording.noise]\ny = {given}\n" if given else ""
     file = cases.simulation("p**2/2 + k*q**2/2", observe={"y": f"{zero} + {size}*q"}, more=more)
-    p = cases.problem(file, [cases.recorded(TIMES, y)], 0.05)
+    p = cases.problem(file, [cases.recorded(TIMES, y)], 0.05, hold)
     priors = replace(priors_without_effects(p), precision=np.full(p.size, 1e-2))
     begin = np.zeros(p.size)
     begin[[0, p.head]] = 1.0
     noises = [(m,) for m in p.searched if given and p.candidate(m).effect is effects.NOISE]
-    fits = calibrate(Stepper(p), np.stack([begin] * max(len(noises), 1)), noises or [()], priors, [len(TIMES)])
+    fits = calibrate(Stepper(p), np.stack([begin] * max(len(noises), 1)), noises or [()], priors, [p.rows[0].fitted])
     assert fits.converged.all()
     return p, fits, priors
 
@@ -77,6 +94,23 @@ def test_it_is_seen_wherever_and_in_whatever_unit_it_is_read(size, zero):
     (white, _, bent), (plain, _, same) = evidences(0.03), evidences(0.03, size=size, zero=zero)
     # The fits stop where they promise less than half a nat, each on its own way.
     assert same.log_evidence - plain.log_evidence == pytest.approx(bent.log_evidence - white.log_evidence, abs=1.0)
+
+
+def test_what_is_known_of_it_is_expected_of_later_rows():
+    """Of a sensor that is off by three times its noise, later readings are predicted to a tenth more than the noise;
+    without it they are missed by twice the noise. The filter looks through the bend, so that both runs start alike."""
+    p, fits, priors = fitted(0.03, hold=0.4)
+    rows = [p.rows[0].fitted]
+    outlook = lambda one: Outlook(Stepper(p), one, 0, np.zeros(1))  # noqa: E731
+    (white,), (bent,) = weigh_white(p, fits, priors, rows), weigh_positional(p, fits, priors, rows)
+    missed = {}
+    for kind, one in (("white", white), ("bent", bent), ("unknown", replace(bent, bends=()))):
+        shown = outlook(one)
+        missed[kind] = np.sqrt(np.mean((shown.readings - p.rows[0].readings)[rows[0] :] ** 2))
+    assert missed["bent"] < 1.1 * NOISE and min(missed["white"], missed["unknown"]) > 2 * NOISE
+    # Errors of the noise's own size, of which the prediction is sure: as dense as white noise can be, but for a tenth.
+    least = norm.logpdf(NOISE * np.random.default_rng(2).normal(size=len(TIMES))[rows[0] :], scale=NOISE).sum()
+    assert outlook(bent).held_out_log_density(1.0) > least - 0.1 * (len(TIMES) - rows[0])
 
 
 def test_white_noise_goes_with_nothing():

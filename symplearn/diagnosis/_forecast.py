@@ -15,6 +15,7 @@ from .._importance import softened
 from .._recording import Recording
 from .._rows import spans_between
 from .._triangular import semidefinite_cholesky
+from ._bend import bent
 from ._outlook import colour_ratio, intensity_of, start_spread, total_noise
 from ._problem import Problem
 from ._record import Forecast
@@ -83,7 +84,7 @@ def _expected(
     ahead = _ahead(stepper.problem, recording, times)
     drawn = _run_on(*_model(stepper), zs, ends, jnp.asarray(stepper.problem.onehot(e.combination, 0)),
                     jnp.asarray(intensity_of(stepper, e)), ahead, jax.random.split(push_key, len(units)))  # fmt: skip
-    return _summary(np.asarray(drawn), log_weights, about_first=e.intensity is None)
+    return _summary(bent(np.asarray(drawn), e.bends), log_weights, about_first=e.intensity is None)
 
 
 def _model(stepper: Stepper) -> tuple[Any, Any, Any]:
@@ -99,7 +100,7 @@ def _by_all_rows(
     known = taught(stepper, e, root)
     zs = jnp.asarray(_within(problem, known.mean + units @ known.root.T))
     seen, states = _run_through(*_model(stepper), zs, jnp.asarray(problem.onehot(e.combination, 0)))
-    return states[:, len(given) - 1], known.log_weights(units, np.asarray(seen)[:, : len(given)], given)
+    return states[:, len(given) - 1], known.log_weights(units, bent(np.asarray(seen)[:, : len(given)], e.bends), given)
 
 
 def _filtered(stepper: Stepper, e: Estimate, zs: Array, key: Array) -> Array:

@@ -62,7 +62,9 @@ def filtered_path(stepper: Stepper, rows: Sequence[int], r: int, z: np.ndarray, 
     force = typical_forces(problem, z, [np.tile(x, (1, 1))] * len(rows))
     span = float(np.median(np.diff(problem.rows[r].times)))
     strong = np.maximum(force, np.abs(force).max() * 1e-3) ** 2 * span * 10
-    _, filtered = run_filter(problem, course, r, z, (), noise, 0 * noise, strong, spread, rows[r])
+    _, filtered = run_filter(
+        problem, course, r, z, (), noise, 0 * noise, strong, spread, problem.rows[r].readings[: rows[r]]
+    )
     means = np.array(filtered.filtered_means[: rows[r]])
     means[0] = x
     return means if bool(filtered.ok) else np.tile(x, (rows[r], 1))

@@ -13,6 +13,7 @@ from .._filter import Filtered
 from .._smoother import Smoothed
 from .._triangular import semidefinite_cholesky
 from ._along import What, along, readings
+from ._bend import bent
 from ._problem import Problem
 from ._stochastic import free_run, row_roots, run_filter, run_smoother
 from ._trajectory import Stepper
@@ -21,7 +22,8 @@ from ._weighed import Estimate
 
 def colour_ratio(estimate: Estimate) -> Float[np.ndarray, " channel"]:
     """Variance of the reading error that lasts, by memory or by place, over the white one; zero where there is none."""
-    kinds = [[c.ratio for c in estimate.colours], [c.ratio for c in estimate.clocks], estimate.bent]
+    unknown = [(bend.spread / noise) ** 2 for bend, noise in zip(estimate.bends, estimate.noise, strict=False)]
+    kinds = [[c.ratio for c in estimate.colours], [c.ratio for c in estimate.clocks], unknown or estimate.bent]
     return sum((np.array(each) for each in kinds if each), np.zeros(len(estimate.noise)))
 
 
@@ -77,8 +79,22 @@ class Outlook:
         e, r = self.estimate, self.recording
         return run_filter(
             self.stepper.problem, self.stepper.courses[r], r, e.z, e.combination, total_noise(e), colour_ratio(e),
-            self.intensity, start_spread(self.stepper, e, r), self.rows.fitted,
+            self.intensity, start_spread(self.stepper, e, r), self._straight[: self.rows.fitted],
         )  # fmt: skip
+
+    @cached_property
+    def _straight(self) -> Float[np.ndarray, "time channel"]:
+        """The readings less the error that goes with what is read, as far as that is known."""
+        if not self.estimate.bends:
+            return self.rows.readings
+        expected = self._run(self._begin, 0)[0]
+        return self.rows.readings - np.nan_to_num(bent(expected, self.estimate.bends) - expected)
+
+    @property
+    def _begin(self) -> Float[np.ndarray, " state"]:
+        """The phase point at the first row."""
+        state = self.stepper.problem.state
+        return self.estimate.z[self.recording * state : (self.recording + 1) * state]
 
     @property
     def ok(self) -> bool:
@@ -96,8 +112,7 @@ class Outlook:
         last = self.rows.fitted - 1
         if self.ok:
             return np.asarray(self._filtered[1].filtered_means[last])
-        part = slice(self.recording * self.stepper.problem.state, (self.recording + 1) * self.stepper.problem.state)
-        return self._run(self.estimate.z[part], 0)[1][last]
+        return self._run(self._begin, 0)[1][last]
 
     @cached_property
     def readings(self) -> Float[np.ndarray, "time channel"]:
@@ -108,13 +123,13 @@ class Outlook:
     @cached_property
     def run(self) -> Float[np.ndarray, "row channel"]:
         """Readings of the free run, from the last fitted row on."""
-        return self._run(self.last_state, self.rows.fitted - 1)[0]
+        return bent(self._run(self.last_state, self.rows.fitted - 1)[0], self.estimate.bends)
 
     @cached_property
     def followed(self) -> Float[np.ndarray, "fitted channel"]:
         """Readings of the filtered phase points over the fitted rows."""
         means = np.asarray(self._filtered[1].filtered_means[: self.rows.fitted])
-        return self.along(readings, means)
+        return bent(self.along(readings, means), self.estimate.bends)
 
     def along(self, what: What, states: Float[np.ndarray, "row state"]) -> np.ndarray:
         """Something that the augmented simulation has at phase points of the leading rows."""

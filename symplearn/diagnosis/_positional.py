@@ -11,16 +11,15 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numpy.polynomial.legendre import legvander
 
+from ._bend import Bend, polynomials
 from ._calibrate import Fits, Priors, residuals, weights
 from ._evidence import variance_inflation
 from ._problem import Problem
 from ._scatter import factor_evidence, law_gain
 from ._weighed import REMAINDER, Estimate, correlated
 
-# Polynomials up to this degree, and variances of the error against the noise's that are tried.
-_DEGREE = 12
+# Variances of the error against the noise's that are tried.
 _RATIOS = np.geomspace(0.03, 1e4, 12)
 
 
@@ -32,6 +31,7 @@ class _Channel:
     plain: int  # columns that are no polynomials
     seen: Bool[np.ndarray, " row"]
     log_weights: float
+    ends: tuple[float, float] = (0.0, 1.0)  # of what is read
 
     @property
     def number(self) -> int:
@@ -59,6 +59,14 @@ class _Channel:
         plain = self.columns[: self.plain]
         return plain - (plain @ rest.T) @ np.linalg.solve(held, rest)
 
+    def bend(self, column: Float[np.ndarray, " column"], ratio: float, noise: float) -> Bend:
+        """What is known of the error, given the plain columns' errors as a sum of them."""
+        rest = self.columns[self.plain :]
+        spread = np.linalg.inv(rest @ rest.T + np.eye(len(rest)) * len(rest) / ratio)
+        mean = spread @ (rest @ (column @ self.columns[: self.plain]))
+        square = np.einsum("ir,ij,jr->", rest, spread, rest) / max(float((rest[0] ** 2).sum()), 1e-300)
+        return Bend(*self.ends, mean, noise * float(np.sqrt(max(square, 0.0))))
+
 
 @np.errstate(all="ignore")  # a lane that diverged is told by its evidence
 def weigh_positional(problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int]) -> list[Estimate]:
@@ -83,22 +91,21 @@ def _channel(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int) 
     weight = weights(problem, rows)
     expected = np.concatenate([p.readings[b, :, j] for p in fits.predictions])
     seen = np.concatenate([w[:, j] > 0 for w in weight])
-    shapes, parts = _polynomials(expected, seen), []
+    ends, parts = _ends(expected, seen), []
+    shapes = polynomials(expected, *ends).T
     for r, (x, w) in enumerate(zip(residuals(problem, fits.predictions, weight), weight, strict=True)):
         slopes = np.zeros((problem.size, len(w)))
         slopes[problem.local(r)] = fits.predictions[r].slopes[b, :, :, j]
         parts.append(np.concatenate([x[b, None, :, j], slopes]))
     root = np.sqrt(np.concatenate([w[:, j] for w in weight]))
     columns = np.where(seen, np.concatenate([np.concatenate(parts, axis=1), shapes]), 0.0) * root
-    return _Channel(columns, 1 + problem.size, seen, float(2 * np.log(root[seen]).sum()))
+    return _Channel(columns, 1 + problem.size, seen, float(2 * np.log(root[seen]).sum()), ends)
 
 
-def _polynomials(expected: Float[np.ndarray, " row"], seen: Bool[np.ndarray, " row"]) -> np.ndarray:
-    """Orthonormal over the range of what is read. Shape (degree + 1, row)."""
+def _ends(expected: Float[np.ndarray, " row"], seen: Bool[np.ndarray, " row"]) -> tuple[float, float]:
+    """The range of what is read."""
     some = expected[seen] if seen.any() else np.zeros(1)
-    place = np.clip(2 * (expected - some.min()) / max(np.ptp(some), 1e-300) - 1, -1.0, 1.0)
-    shapes: np.ndarray = legvander(np.nan_to_num(place), _DEGREE) * np.sqrt(2 * np.arange(_DEGREE + 1) + 1)
-    return shapes.T
+    return float(some.min()), float(some.max())
 
 
 def whitened_along(
@@ -108,7 +115,8 @@ def whitened_along(
     """One channel's columns, by recording, whitened beside an error that goes with what is read: the noise's variance
     and that of `ratio` times its size together. `shown` are the expected readings."""
     w, every = np.concatenate(weight), np.concatenate(columns, axis=1)
-    rest = np.where(w > 0, _polynomials(np.concatenate(shown), w > 0), 0.0) * np.sqrt(w)
+    expected = np.concatenate(shown)
+    rest = np.where(w > 0, polynomials(expected, *_ends(expected, w > 0)).T, 0.0) * np.sqrt(w)
     _, sizes, ways = np.linalg.svd(rest, full_matrices=False)
     less = 1.0 - 1.0 / np.sqrt(1.0 + ratio / len(rest) * sizes**2)
     every = every * np.sqrt(w)
@@ -154,7 +162,9 @@ def _told(
     averaged = np.exp([c.log_weights / max(c.number, 1) for c in channels])
     bent = np.where(told, 0.0, (total / one.noise**2 - 1.0) / averaged)
     inflation = variance_inflation(scores.T)
-    return replace(one, kind="positional", bent=tuple(bent.tolist()), log_evidence=value, inflation=inflation)
+    bends = tuple(c.bend(column, *both) for c, *both in zip(channels, ratios, one.noise, strict=True))
+    return replace(one, kind="positional", bent=tuple(bent.tolist()), bends=() if told.any() else bends,
+                   log_evidence=value, inflation=inflation)  # fmt: skip
 
 
 def _left(seen: Bool[np.ndarray, " row"], errors: np.ndarray, square: float) -> Float[np.ndarray, " row"]:

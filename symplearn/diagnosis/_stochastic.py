@@ -115,16 +115,15 @@ def run_filter(
     ratio: Float[np.ndarray, " channel"],
     intensity: Float[np.ndarray, " d"],
     spread: Float[np.ndarray, "state state"],
-    seen: int,
+    readings: Float[np.ndarray, "row channel"],
 ) -> tuple[Any, Filtered]:
     """Filter a recording from the phase point in `z` with covariance `spread`; also returns what the filter was given.
 
-    Readings from row `seen` on are hidden; rows beyond the recording's own are padding.
+    Readings after those of the leading rows that are given are hidden; rows beyond the recording's own are padding.
     """
     length = course.times.shape[0]
     head, f = problem.head, problem.calibrated.size
     found = problem.coefficients(recording, z, combination) - problem.coefficients(recording, z, ())
-    readings = padded(problem.rows[recording].readings[:seen], length, np.nan)
     model, spans, contexts, filtered = _filter(
         problem.equations,
         problem.integrator,
@@ -136,7 +135,7 @@ def run_filter(
         jax.device_put(softness(problem, course, z, recording)),
         jax.device_put(z[recording * problem.state : (recording + 1) * problem.state]),
         jax.device_put(spread),
-        jax.device_put(readings),
+        jax.device_put(padded(readings, length, np.nan)),
         jax.device_put(row_roots(problem, recording, length, ratio)),
     )
     return (model, spans, contexts), filtered

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .._triangular import semidefinite_cholesky
+from ._bend import bent
 from ._outlook import colour_ratio, total_noise
 from ._problem import Problem
 from ._stochastic import row_roots
@@ -48,7 +49,8 @@ class Errors:
         z[problem.local(0)] = own
         found = stepper.predict(z[None], [e.combination], [length] + [1] * (len(problem.rows) - 1))[0]
         scale = np.where(np.isnan(rows.readings), 0.0, row_roots(problem, 0, length, colour_ratio(e)) / total_noise(e))
-        return cls(scale, (np.nan_to_num(rows.readings) - found.readings[0]) * scale, -found.slopes[0] * scale)
+        expected = bent(found.readings[0], e.bends)
+        return cls(scale, (np.nan_to_num(rows.readings) - expected) * scale, -found.slopes[0] * scale)
 
     def among(self, some: Bool[np.ndarray, "time channel"]) -> tuple[np.ndarray, np.ndarray]:
         """Errors of some readings, and their slopes."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
+from ._bend import Bend
 from ._calibrate import Fits, Priors, normal_equations, residuals, weights
 from ._coloured import Colour, fit_colour, whitened_gram, whitened_residuals, whitened_series
 from ._evidence import Laplace, laplace, variance_inflation
@@ -32,7 +33,8 @@ class Estimate:
 
     `kind` is `white` (no remainder), `coloured` (an error of the sensor with a memory), `clock` (one of its clock
     beside that), `positional` (one that goes with what is read) or `force` (a white missing force of `intensity`).
-    `noise` is the white sd of one original reading, `bent` the variance of a positional error against its square.
+    `noise` is the white sd of one original reading, `bent` the variance of a positional error against its square,
+    `bends` that error itself.
     """
 
     combination: Combination
@@ -47,6 +49,7 @@ class Estimate:
     paths: list[np.ndarray] | None = field(default=None, repr=False)
     colours: tuple[Colour, ...] = ()
     bent: tuple[float, ...] = ()
+    bends: tuple[Bend, ...] = ()
     clocks: tuple[Colour, ...] = ()  # errors of the times, as the rms error of the reading that they make
     modes: tuple[Mode, ...] = ()  # all optima that were found, this one among them
     outliers: tuple[tuple[float, float], ...] = ()  # share and size by channel, where they were left out
