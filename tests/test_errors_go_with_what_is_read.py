@@ -11,6 +11,7 @@ from scipy.stats import norm, t
 from symplearn import _effects as effects
 from symplearn.diagnosis._calibrate import calibrate
 from symplearn.diagnosis._clock import weigh_clock
+from symplearn.diagnosis._forecast import forecast
 from symplearn.diagnosis._outlook import Outlook
 from symplearn.diagnosis._positional import _Channel, weigh_positional
 from symplearn.diagnosis._start import priors_without_effects
@@ -49,13 +50,22 @@ def test_the_error_is_what_a_dense_process_expects(ratio):
     assert found.spread == pytest.approx(0.3 * np.sqrt(left), rel=1e-9)
 
 
+def swing(times):
+    """A spring whose motion dies slowly, by SciPy."""
+    return cases.solved(lambda t, x: [x[1], -x[0] - 0.01 * x[1]], [1.0, 0.0], times)[:, 0]
+
+
+def read(q, scale):
+    """What the bent sensor reads."""
+    return q + scale * (3 * q**2 - 2 * q**4)
+
+
 def fitted(scale, errors=None, given=0.0, size=1.0, zero=0.0, hold=0.0):
     """A spring, its stiffness calibrated, whose reading a sensor bends by `scale`, fitted; its noise is `given`, and
     said to be wrong, or not. It is read in units of `size` from `zero` on; a share is held out."""
-    rates = lambda t, x: [x[1], -x[0] - 0.01 * x[1]]  # noqa: E731
-    q = cases.solved(rates, [1.0, 0.0], TIMES)[:, 0]
+    q = swing(TIMES)
     errors = np.random.default_rng(2).normal(size=len(q)) if errors is None else errors
-    y = zero + size * (q + scale * (3 * q**2 - 2 * q**4) + NOISE * errors)
+    y = zero + size * (read(q, scale) + NOISE * errors)
     more = (
         '[parameters]\nk = { value = 1.0, sd = 0.1 }\n[[terms]]\neffect = "viscous_damping"\ntarget = "q"\nc = 0.01\n'
     )
@@ -111,6 +121,17 @@ def test_what_is_known_of_it_is_expected_of_later_rows():
     # Errors of the noise's own size, of which the prediction is sure: as dense as white noise can be, but for a tenth.
     least = norm.logpdf(NOISE * np.random.default_rng(2).normal(size=len(TIMES))[rows[0] :], scale=NOISE).sum()
     assert outlook(bent).held_out_log_density(1.0) > least - 0.1 * (len(TIMES) - rows[0])
+
+
+def test_a_forecast_expects_it_too():
+    """Readings to come are those of the bent sensor, to a quarter of its noise, and not those of a straight one."""
+    p, fits, priors = fitted(0.03)
+    (white,), (bent,) = (weigh(p, fits, priors, [len(TIMES)]) for weigh in (weigh_white, weigh_positional))
+    later = np.linspace(50.5, 70.0, 100)
+    truth, rows = read(swing(np.append(0.0, later))[1:], 0.03), p.rows[0]
+    columns = forecast(Stepper(p), cases.recorded(rows.times, rows.readings), white, bent, later, 1.0, 0).columns
+    off = {label: np.sqrt(np.mean((columns["y"][label] - truth) ** 2)) for label in ("before", "after")}
+    assert off["after"] < 0.25 * NOISE and off["before"] > NOISE
 
 
 def test_white_noise_goes_with_nothing():

@@ -62,6 +62,9 @@ def warnings(
             out.append(f"{name} moved {moved:.1f} of its prior standard deviations to fit the recording")
     if chosen is not None and chosen.best.kind != "white":
         out.append(f"a remainder without a name is left beside the findings: {_REMAINDERS[chosen.best.kind]}")
+    if chosen is not None and any(o.estimate.bends for o in with_):
+        out.append("what is known of that error is part of the readings that are expected with the findings; "
+                   "augmented.toml does not have it")  # fmt: skip
     if found.ahead:
         out.append("the remainder is clear, so answers were also weighed by how well they predict rows that they were "
                    "not fitted to")  # fmt: skip
