@@ -52,11 +52,17 @@ def late(seed):
     return 0.02 * np.array(x)
 
 
-def weighed(delay, seed=2):
-    """Drag, which is true, and a viscous damping, under noise alone, an error of the sensor, and one of its clock."""
+def swing(delay, seed=2):
+    """A spring with quadratic drag, read late: SciPy's."""
     rates = lambda t, x: [x[1], -x[0] - 0.03 * abs(x[1]) * x[1]]  # noqa: E731
     q = cases.solved(rates, [1.0, 0.0], np.append(-1.0, TIMES + delay))[1:, 0]
-    p = problem(q + NOISE * np.random.default_rng(seed).normal(size=len(q)))
+    return q + NOISE * np.random.default_rng(seed).normal(size=len(q))
+
+
+def weighed(delay):
+    """Drag, which is true, and a viscous damping, under noise alone, an error of the sensor, and one of its clock."""
+    q = swing(delay)
+    p = problem(q)
     priors = replace(priors_without_effects(p), scales=np.full(p.equations.size, 0.3), precision=np.full(p.size, 1e-2))
     names = [p.candidate(m).effect.name for m in p.searched]
     laws = [(p.searched[names.index(name)],) for name in ("quadratic_drag", "viscous_damping")]

@@ -7,15 +7,21 @@ import engine_cases as cases
 import numpy as np
 import pytest
 from numpy.polynomial import Legendre
+from test_a_clock_may_wander import TIMES as LATE
+from test_a_clock_may_wander import late, problem, swing
 from test_coloured_errors_are_whitened import autocovariance
 
 from symplearn.diagnosis._calibrate import calibrate, weights
 from symplearn.diagnosis._coloured import Colour
 from symplearn.diagnosis._exchange import Regression
-from symplearn.diagnosis._score import Unit
+from symplearn.diagnosis._found import Found
+from symplearn.diagnosis._prospects import Prospects
+from symplearn.diagnosis._refinement import Refinement
+from symplearn.diagnosis._score import Start, Unit
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
 from symplearn.diagnosis._weighed import Estimate
+from symplearn.diagnosis._weigher import Weigher
 from symplearn.diagnosis._whitening import whitening
 
 COLOUR, CLOCK, BENT, LEFT = Colour(40.0, 2.0, 1.001, 0.0), Colour(300.0, 0.5, 30.0, 0.0), 25.0, 0.03
@@ -115,3 +121,23 @@ def test_a_slow_error_no_longer_looks_like_a_drift():
     damping = found["coloured"]["viscous_damping"].z[p.slots]
     # The error has some power at the oscillator's own frequency: a standard deviation of a seventh here.
     assert damping == pytest.approx(0.002, rel=0.3)
+
+
+def test_the_true_law_is_found_beside_a_wandering_clock():
+    """Of a swing with quadratic drag whose rows are read up to a hundredth of a cycle too early or late only a damping
+    was weighed, and its clock: the drag is found from there, weighed beside a clock itself, and ahead."""
+    p, rows = problem(swing(late(0))), [len(LATE)]
+    priors = replace(priors_without_effects(p), scales=np.full(p.equations.size, 0.3), precision=np.full(p.size, 1e-2))
+    wanted = {p.candidate(m).effect.name: m for m in p.searched}
+    drag, damping = (wanted["quadratic_drag"],), (wanted["viscous_damping"],)
+    few = replace(p, searched=tuple(wanted[name] for name in ("viscous_damping", "quadratic_drag", "sensor_drift")))
+    weigher = Weigher(Stepper(few), Found(few, priors))
+    z = np.zeros(p.size)
+    z[[0, p.head]] = 1.0
+    weigher.weigh([Start((), z, 0.0), Start(damping, z, 0.0)])
+    weigher.weigh_clocks([(), damping])
+    assert drag not in weigher.found.estimates and rows == weigher.rows
+    Refinement(Prospects(weigher), lambda line: None).weigh_beside_the_remainder()
+    found = weigher.found
+    assert found.of(drag, "clock").log_evidence > found.best(damping) + 10
+    assert max(found.estimates, key=found.odds) == drag

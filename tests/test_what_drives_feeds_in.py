@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from symplearn.diagnosis import Options, diagnose
 from symplearn.diagnosis._activity import log_fed
+from symplearn.diagnosis._build import Restriction
 from symplearn.diagnosis._effect_priors import with_effects
 from symplearn.diagnosis._motion import motion_along
 from symplearn.diagnosis._problem import MOST
@@ -85,3 +87,17 @@ def test_without_a_self_excitation_nothing_is_owed(known):
     p, priors = known
     c, z = combined(p, {"coulomb_friction": [0.2], "viscous_damping": [0.1]})
     assert log_fed(p, c, priors, z, np.eye(p.size)) == 0.0
+
+
+@pytest.mark.slow
+def test_a_swing_that_only_decays_is_not_driven():
+    """A damping that grows with the square of the position, which no word means, is a friction to the tool and no
+    self-excitation, though one that hardly drives would be that very law."""
+    times = np.linspace(0.0, 60.0, 400)
+    q = cases.solved(lambda t, x: [x[1], -x[0] - (0.004 + 0.1 * x[0] ** 2) * x[1]], [1.0, 0.0], times)[:, 0]
+    reading = q + 0.003 * np.random.default_rng(0).normal(size=len(times))
+    some = Restriction(("viscous_damping", "quadratic_drag", "coulomb_friction", "self_excitation"))
+    found = diagnose(cases.simulation("p**2/2 + k*q**2/2", more="[parameters]\nk = { value = 1.0, sd = 0.01 }"),
+                     [cases.recorded(times, reading)], Options(restriction=some, jobs=2)).document  # fmt: skip
+    assert found["verdict"] == "mismatch" and found["family_probability"]["dissipation"] > 0.99
+    assert found["family_probability"]["activity"] < 0.01
