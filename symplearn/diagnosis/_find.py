@@ -47,8 +47,8 @@ def searched(
     noise = np.maximum(seeds.noise[0], _ROUGH * rough_noise(problem, rows_fitted(problem.rows)))
     finer, substep = refined(rebuild, problem, seeds.z[0], noise, substep)
     stepper = stepper if finer is problem else Stepper(finer, options.jobs)
-    search = Search(stepper, seeds.z, deadline, options.progress)
-    found = search.run()
+    search = _run(stepper, seeds.z, deadline, options)
+    found = search.found
     best = max((e for es in found.estimates.values() for e in es), key=lambda e: e.log_evidence)
     if np.isfinite(best.log_evidence):
         finer, _ = refined(rebuild, finer, best.z, best.reading_noise, substep, best.combination)
@@ -58,6 +58,20 @@ def searched(
     found, stepper = _with_unnamed(file, recordings, options, search, found)
     look_ahead(search.stepper, found, search.rows)
     return found, stepper
+
+
+def _run(stepper: Stepper, seeds: np.ndarray, deadline: float, options: Options) -> Search:
+    """Search with outliers taken out; anew with those of a column left in that turn out to be none: what the simulation
+    misses of a motion may look like outliers of a path that follows it, and takes their places in a combination."""
+    spared: frozenset[int] = frozenset()
+    while True:
+        search = Search(stepper, seeds, deadline, options.progress, spared)
+        search.run()
+        doubtful = search.doubtful_outliers()
+        if not doubtful or not search.found.complete:
+            return search
+        options.progress("leaving readings in that are no outliers")
+        spared |= doubtful
 
 
 def _with_unnamed(

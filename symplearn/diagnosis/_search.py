@@ -9,7 +9,7 @@ import numpy as np
 from .._effects import NOISE, OUTLIERS
 from ._calibrate import Priors
 from ._effect_priors import with_effects, with_unnamed
-from ._found import Found
+from ._found import Found, speaker
 from ._motion import extent, motion_along
 from ._noisy import PathFit, fit_paths
 from ._null_paths import beside, null_paths
@@ -38,6 +38,8 @@ _BATCH = 24
 _SIMPLE = 2
 # Combinations that are weighed again in finer steps.
 _AGAIN = 24
+# Outliers are larger than this many times the noise.
+_FAR = 3.0
 # Places at which an effect is tried beside others than the best of the size below.
 _FEW = 60
 _ONE_MORE = {1: "one effect", 2: "a second effect", 3: "a third effect"}
@@ -46,10 +48,17 @@ _ONE_MORE = {1: "one effect", 2: "a second effect", 3: "a third effect"}
 class Search:
     """Finds which combinations of effects explain the recordings of a problem, and with what evidence."""
 
-    def __init__(self, stepper: Stepper, seeds: np.ndarray, deadline: float, progress: Callable[[str], None]):
+    def __init__(
+        self, stepper: Stepper, seeds: np.ndarray, deadline: float, progress: Callable[[str], None],
+        spared: frozenset[int] = frozenset(),
+    ):  # fmt: skip
         self.weigher = Weigher(stepper, Found(stepper.problem, priors_without_effects(stepper.problem)))
         self.seeds, self.seed, self.rows = seeds, seeds[0], self.weigher.rows
-        self.deadline, self.progress = deadline, progress
+        self.deadline, self.progress, self.spared = (
+            deadline,
+            progress,
+            spared,
+        )  # columns that no reading is taken out of
         self.prospects = Prospects(self.weigher)
         self.refinement = Refinement(self.prospects, progress)
 
@@ -93,12 +102,22 @@ class Search:
         self.weigher.weigh_with_outliers_in()
         return self.found
 
+    def doubtful_outliers(self) -> frozenset[int]:
+        """Columns of which readings were taken out that the best answer leaves in, or has off by little more than the
+        noise."""
+        best = speaker(self.found.estimates[max(self.found.estimates, key=self.found.odds)])
+        sizes = dict(enumerate(size for _, size in best.outliers))
+        columns = {m: self.problem.candidate(m).place for m in self.base}
+        return frozenset(
+            j for m, j in columns.items() if m not in best.combination or sizes.get(j, np.inf) < _FAR * best.noise[j]
+        )
+
     def _begin(self) -> None:
         """The simulation without effects, under every remainder; and what every effect's prior is, from its motion."""
         bare, w = self.found.priors, self.weigher
         self._follow(bare)
         # From trajectories, too: a path that needs a strong force to follow the recording goes through outliers.
-        if w.take_out_outliers(self.null_paths, w.found.priors):
+        if w.take_out_outliers(self.null_paths, w.found.priors, self.spared):
             w.found = Found(self.problem, bare)
             self._follow(bare)
         w.add_paths(self.null_paths)

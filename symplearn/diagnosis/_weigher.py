@@ -56,14 +56,16 @@ class Weigher:
             self.stepper = stepper.on(stepper.problem.without(self.flagged))
         self.found = found
 
-    def take_out_outliers(self, fits: Sequence[PathFit], priors: Priors) -> bool:
-        """Leave out the readings that lie far off the path that is likeliest without them; whether there are any.
+    def take_out_outliers(self, fits: Sequence[PathFit], priors: Priors, spared: frozenset[int] = frozenset()) -> bool:
+        """Leave out the readings that lie far off the path that is likeliest without them, but for the columns that are
+        `spared`; whether there are any.
 
         Every path loses its own: one that a strong missing force may bend goes through outliers and shows few.
         """
         problem = self.plain.problem
         columns = {problem.candidate(m).place: m for m in problem.searched if problem.candidate(m).effect is OUTLIERS}
-        may = np.array([j in columns or j in problem.known_outliers for j in range(problem.channels)])
+        able = (columns.keys() | set(problem.known_outliers)) - spared
+        may = np.array([j in able for j in range(problem.channels)])
         lanes = [fit for fit in fits if np.isfinite(fit.log_evidence)]
         for _ in range(_CLEARED):
             far = [self._far(fit, may) for fit in lanes]
