@@ -10,7 +10,7 @@ from .._recording import Recording
 from .._simulation_records import SimulationFile
 from ._ahead import look_ahead
 from ._build import augmented_equations, build, first_substep, refined, rows_fitted
-from ._found import Found
+from ._found import Found, doubtful_outliers, speaker
 from ._locate import strained_coordinates
 from ._null_paths import rough_noise
 from ._options import Options
@@ -66,9 +66,10 @@ def _run(stepper: Stepper, seeds: np.ndarray, deadline: float, options: Options)
     spared: frozenset[int] = frozenset()
     while True:
         search = Search(stepper, seeds, deadline, options.progress, spared)
-        search.run()
-        doubtful = search.doubtful_outliers()
-        if not doubtful or not search.found.complete:
+        found = search.run()
+        best = speaker(found.estimates[max(found.estimates, key=found.odds)])
+        doubtful = doubtful_outliers(search.problem, search.base, best)
+        if not doubtful or not found.complete:
             return search
         options.progress("leaving readings in that are no outliers")
         spared |= doubtful

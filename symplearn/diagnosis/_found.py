@@ -14,6 +14,8 @@ from ._weighed import Estimate, Mode
 
 # Two optima whose places differ by more than this many standard deviations are two modes.
 _APART = 2.0
+# Outliers are larger than this many times the noise.
+_FAR = 3.0
 # Nats that an estimate which did not converge must be ahead to be reported nevertheless.
 _UNCONVERGED = 3.0
 
@@ -30,6 +32,14 @@ class Ahead:
 def speaker(estimates: Sequence[Estimate]) -> Estimate:
     """The estimate of the best kind of remainder; one that converged is preferred to one barely ahead that did not."""
     return max(estimates, key=lambda e: e.log_evidence - (0.0 if e.converged else _UNCONVERGED))
+
+
+def doubtful_outliers(problem: Problem, taken_out: Combination, best: Estimate) -> frozenset[int]:
+    """Columns of which readings were taken out that the best answer leaves in, or has off by little more than the
+    noise."""
+    sizes, columns = dict(enumerate(best.outliers)), {m: problem.candidate(m).place for m in taken_out}
+    small = {j for j, (_, size) in sizes.items() if size < _FAR * best.noise[j]}
+    return frozenset(j for m, j in columns.items() if m not in best.combination or j in small)
 
 
 def within_signs(problem: Problem, estimate: Estimate) -> Estimate:

@@ -9,7 +9,7 @@ import numpy as np
 from .._effects import NOISE, OUTLIERS
 from ._calibrate import Priors
 from ._effect_priors import with_effects, with_unnamed
-from ._found import Found, speaker
+from ._found import Found
 from ._motion import extent, motion_along
 from ._noisy import PathFit, fit_paths
 from ._null_paths import beside, null_paths
@@ -38,8 +38,6 @@ _BATCH = 24
 _SIMPLE = 2
 # Combinations that are weighed again in finer steps.
 _AGAIN = 24
-# Outliers are larger than this many times the noise.
-_FAR = 3.0
 # Places at which an effect is tried beside others than the best of the size below.
 _FEW = 60
 _ONE_MORE = {1: "one effect", 2: "a second effect", 3: "a third effect"}
@@ -101,16 +99,6 @@ class Search:
         self._weigh_forces()
         self.weigher.weigh_with_outliers_in()
         return self.found
-
-    def doubtful_outliers(self) -> frozenset[int]:
-        """Columns of which readings were taken out that the best answer leaves in, or has off by little more than the
-        noise."""
-        best = speaker(self.found.estimates[max(self.found.estimates, key=self.found.odds)])
-        sizes = dict(enumerate(size for _, size in best.outliers))
-        columns = {m: self.problem.candidate(m).place for m in self.base}
-        return frozenset(
-            j for m, j in columns.items() if m not in best.combination or sizes.get(j, np.inf) < _FAR * best.noise[j]
-        )
 
     def _begin(self) -> None:
         """The simulation without effects, under every remainder; and what every effect's prior is, from its motion."""

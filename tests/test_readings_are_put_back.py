@@ -1,0 +1,60 @@
+"""Readings that were taken out as outliers and turn out to be none are put back, and all is searched anew."""
+
+import engine_cases as cases
+import numpy as np
+import pytest
+
+from symplearn.diagnosis import Options, diagnose
+from symplearn.diagnosis._build import Restriction
+from symplearn.diagnosis._found import doubtful_outliers
+from symplearn.diagnosis._weighed import Estimate
+
+CARTS = """
+[parameters]
+k1 = 9.9
+kc = { value = 5.9, sd = 0.3 }
+[initial]
+x1 = { value = 0.88, sd = 0.05 }
+x2 = { value = -0.75, sd = 0.04 }
+p1 = 0.0
+p2 = 0.0
+"""
+
+
+@pytest.mark.slow
+def test_a_wrong_scale_leaves_no_outliers():
+    """Two carts, a sensor that reads a sixth too much and a spring that wears out by three per mille: a path that
+    follows both readings misses one of them by far, and still nothing but the two is found."""
+    times, rng = np.linspace(0.0, 51.0, 363), np.random.default_rng(3)
+
+    def rates(t, x):
+        pull = 5.9 * (x[0] - x[1])
+        return [x[2] / 1.6, x[3] / 1.2, -9.9 * (1 - 6e-5 * t) * x[0] - pull, -15.4 * x[1] + pull]
+
+    x = cases.solved(rates, [0.88, -0.75, 0.0, 0.0], times)
+    readings = x[:, :2] * [1.0, 1.176] + rng.normal(size=(363, 2)) * [0.0057, 0.0164]
+    file = cases.simulation(
+        "p1**2/3.2 + p2**2/2.4 + k1*x1**2/2 + 15.4*x2**2/2 + kc*(x1 - x2)**2/2",
+        ["x1", "x2"], ["p1", "p2"], {"a": "x1", "b": "x2"}, more=CARTS,
+    )  # fmt: skip
+    said: list[str] = []
+    some = Restriction(("sensor_gain", "sensor_outliers", "parameter_drift", "viscous_damping"))
+    found = diagnose(file, [cases.recorded(times, readings, columns=("a", "b"))],
+                     Options(restriction=some, jobs=2, progress=said.append)).document  # fmt: skip
+    assert "leaving readings in that are no outliers" in said
+    assert {(f["effect"], f["target"]) for f in found["findings"]} == {("sensor_gain", "b"), ("parameter_drift", "k1")}
+
+
+@pytest.mark.parametrize(
+    ("said", "size", "doubtful"),
+    [("sensor_outliers", 2.0, {0}), ("sensor_outliers", 4.0, set()), ("viscous_damping", 4.0, {0})],
+    ids=["no larger than the noise", "larger", "left in by the best answer"],
+)
+def test_outliers_are_far_off(said, size, doubtful):
+    """Those below three times the noise are none, nor are those that the best answer does without."""
+    times = np.linspace(0.0, 10.0, 50)
+    p = cases.problem(cases.simulation("p**2/2 + q**2/2"), [cases.recorded(times, np.cos(times))], 0.05)
+    names = {p.candidate(m).effect.name: m for m in p.searched}
+    best = Estimate((names[said],), "white", np.zeros(p.size), np.eye(p.size), np.array([0.5]), 0.0, True,
+                    outliers=((0.1, 0.5 * size),))  # fmt: skip
+    assert doubtful_outliers(p, (names["sensor_outliers"],), best) == doubtful
