@@ -28,6 +28,7 @@ def steppers():
     return [first, *(first.on(cases.problem(file, [made(seed)], 0.07)) for seed in range(1, 3))]
 
 
+@pytest.mark.slow
 def test_a_stop_that_was_found_has_converged(steppers):
     """In three recordings of one motion with different noise, from eight thresholds about the true one: the best fit
     follows the readings within their noise and counts as ended."""

@@ -124,6 +124,7 @@ def test_same_files_give_the_same_answer(small, command, tmp_path):
     assert (tmp_path / "augmented.toml").read_text() == (out / "augmented.toml").read_text()
 
 
+@pytest.mark.slow
 def test_nothing_held_out_is_null(command, tmp_path):
     """--holdout 0 fits every row: the held-out keys are null, all others as ever."""
     ran = command("diagnose", *write_case(tmp_path), "--out", tmp_path / "out", *ONE_EFFECT, "--holdout", "0")
@@ -145,6 +146,7 @@ def test_effects_can_be_restricted(small, command, tmp_path):
     assert mentioned(read(tmp_path)) == {"viscous_damping"}
 
 
+@pytest.mark.slow
 def test_compressed_files_read_the_same(small, command, tmp_path):
     """A .csv.gz gives the answer of its .csv."""
     _, (simulation, recording), out = small
@@ -155,6 +157,7 @@ def test_compressed_files_read_the_same(small, command, tmp_path):
     assert without_seconds(tmp_path) == without_seconds(out)
 
 
+@pytest.mark.slow
 def test_several_files_and_groups_are_several_recordings(command, tmp_path):
     """Two files, or two groups in one, are the same two recordings: numbered, with their own windows and start."""
     first, second = damped(seed=1), damped(start=0.5, seed=2)

@@ -111,6 +111,7 @@ def test_it_is_seen_wherever_and_in_whatever_unit_it_is_read(size, zero, bent_sc
     assert same.log_evidence - plain.log_evidence == pytest.approx(bent.log_evidence - white.log_evidence, abs=1.0)
 
 
+@pytest.mark.slow
 def test_what_is_known_of_it_is_expected_of_later_rows():
     """Of a sensor that is off by three times its noise, later readings are predicted to a tenth more than the noise;
     without it they are missed by twice the noise. The filter looks through the bend, so that both runs start alike."""

@@ -160,6 +160,7 @@ def drawn(model, count=20_000):
     return (np.asarray(one) for one in jax.jit(jax.vmap(draw))(jax.random.split(jax.random.key(8), count)))
 
 
+@pytest.mark.slow
 def test_simulated_recordings_have_the_models_moments():
     """20,000 recordings of a linear model with noise of four kinds have its closed means and covariances."""
     A, H, Q, R, m0, P0 = cases.linear_system()

@@ -101,6 +101,7 @@ def scored(case, passage):
     return filtered, slopes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_score_slopes_and_moments_are_the_sequential_ones(case):
     """To 1e-10: likelihood, gradient, predicted and filtered moments, innovations; with gaps and inputs."""

@@ -114,6 +114,7 @@ def test_measurement_noise_adds_its_variance(linear):
     assert np.all(np.abs(ahead.sd() ** 2 / (closed_form(ys, True)[1][:1] + 0.09) - 1) < 3 * np.sqrt(2 / DRAWS))
 
 
+@pytest.mark.slow
 def test_in_sample_paths_start_at_the_smoothed_state(linear):
     """In sample, the first state of the draws is that of the joint normal given all readings."""
     posterior, ys = linear

@@ -38,7 +38,8 @@ def test_stopped_in_the_middle(blow, tmp_path):
     assert "Traceback" not in rest
 
 
-@pytest.mark.parametrize("delay", [0.0, pytest.param(0.4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", [0.0, 0.4])
 def test_killed_while_it_writes(delay, tmp_path):
     """Killed while the report is drawn or written, every file under a final name is complete."""
     run = started(tmp_path, tmp_path / "out")

@@ -60,6 +60,7 @@ def test_shares_of_two_modes_and_the_evidence():
     assert "8 runs of 2048 particles" in str(posterior)
 
 
+@pytest.mark.slow
 def test_impossible_places_weigh_nothing():
     """Where half of the first particles are impossible, as where trajectories escape, the evidence is half as large."""
     posterior = drawn(Box(jnp.asarray(0.0)), [1.0, 0.0])
@@ -94,6 +95,7 @@ def test_runs_that_lose_a_mode_disagree():
     assert not posterior.converged and "The chains disagree" in str(posterior)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_tempered_is_said():
     """No possible particle, too few powers and options out of range are refused in a sentence that says what to try."""
 

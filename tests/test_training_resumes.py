@@ -77,7 +77,7 @@ def test_loss_falls_and_the_record_says_how(name):
     assert "no MAP" in str(found)
 
 
-@pytest.mark.parametrize("name", ["likelihood", "batches"])
+@pytest.mark.parametrize("name", [pytest.param("likelihood", marks=pytest.mark.slow), "batches"])
 def test_killed_and_resumed_is_uninterrupted(name, tmp_path, monkeypatch):
     """A training that is killed after some epochs and started again ends at the same bits as one that is not."""
     objective = {"likelihood": MarginalLikelihood(), "batches": BATCHES}[name]
