@@ -123,6 +123,7 @@ def test_a_slow_error_no_longer_looks_like_a_drift():
     assert damping == pytest.approx(0.002, rel=0.3)
 
 
+@pytest.mark.slow
 def test_the_true_law_is_found_beside_a_wandering_clock():
     """Of a swing with quadratic drag whose rows are read up to a hundredth of a cycle too early or late only a damping
     was weighed, and its clock: the drag is found from there, weighed beside a clock itself, and ahead."""

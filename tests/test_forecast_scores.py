@@ -179,6 +179,7 @@ def filtered_mean(ys, k):
     return m
 
 
+@pytest.mark.slow
 def test_process_noise_alone_spreads_the_map():
     """Free-running from the MAP's mean state, the variance is the sum of A^k Q A'^k; filtered, it is Q at every reading
     and the mean is one step of the Kalman filter's mean before it."""

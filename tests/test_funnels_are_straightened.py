@@ -213,6 +213,7 @@ def test_no_funnel_where_none_can_be():
     assert funnel_of(known, log_posterior_of(known)) is None
 
 
+@pytest.mark.slow
 def test_blocks_are_places_of_the_free_vector(walk):
     """`DRAM` with blocks walks in free coordinates: the variance, in no block, never moves."""
     estimate, _, _ = walk

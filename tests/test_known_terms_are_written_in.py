@@ -186,6 +186,7 @@ t_star = 4.321
 """
 
 
+@pytest.mark.slow
 def test_calibrated_coefficients_are_recovered():
     """Coefficients with a prior, additive or written in, of one recording or of both, end at the truth."""
     push = lambda t: 0.3 * np.cos(1.7 * t + 0.4)  # noqa: E731

@@ -108,6 +108,7 @@ def test_score_slopes_and_moments_are_the_sequential_ones(case):
     same(scored(case, PARALLEL), scored(case, SEQUENTIAL))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", MORE.values(), ids=MORE)
 def test_recordings_of_any_size_are_filtered_alike(case):
     """To 1e-10: likelihood and moments of one reading, two, a thousand; from a start known or all but unknown."""

@@ -46,6 +46,7 @@ def off_by(by_run, exact):
     return abs(np.mean(by_run) - exact) / (np.std(by_run, ddof=1) / len(by_run) ** 0.5)
 
 
+@pytest.mark.slow
 def test_shares_of_two_modes_and_the_evidence():
     """Started in the lesser of two modes eight standard deviations apart: shares, moments and evidence are right."""
     posterior = drawn(TwoModes(jnp.asarray([4.0, 0.0]), jnp.asarray(0.7)), [-4.0, 0.0])
