@@ -65,8 +65,9 @@ def test_what_loses_more_than_it_feeds_is_impossible(values, drives, known):
     p, priors = known
     c, z = combined(p, values)
     found = log_fed(p, c, priors, z, np.diag(np.full(p.size, 1e-6) ** 2))
-    thirds = [surplus(values, part) for part in np.array_split(np.arange(len(TIMES)), 10)]
-    assert drives == (max(thirds) > 0) and (found == pytest.approx(0.0, abs=1e-6)) == drives
+    tenths = [surplus(values, part) for part in np.array_split(np.arange(len(TIMES)), 10)]
+    # 1e-6: the log of a probability of one, of a surplus of hundreds of standard deviations.
+    assert drives == (max(tenths) > 0) and (found == pytest.approx(0.0, abs=1e-6)) == drives
     assert drives or found < -100
 
 
@@ -78,7 +79,8 @@ def test_what_is_uncertain_is_weighed_by_its_probability(known):
     spread = np.zeros((p.size, p.size))
     place = next(place for m, place in p.placed(c) if p.candidate(m).effect.name == "viscous_damping")
     spread[place, place] = 0.02**2
-    # Both go with the speed's square, so that one more standard deviation of the damping balances them at any time.
+    # Both go with the speed's square, so that one more standard deviation of the damping balances them at any time: to
+    # round-off, of which 1e-9 is ample.
     assert log_fed(p, c, priors, z, spread) == pytest.approx(norm.logcdf(-1.0), abs=1e-9)
 
 

@@ -37,7 +37,7 @@ class Priors:
     lower: Float[np.ndarray, " coefficient"]
     upper: Float[np.ndarray, " coefficient"]
     unseen: Float[np.ndarray, "2"]
-    powers: Float[np.ndarray, "stretch value"] = field(default_factory=lambda: np.zeros((0, 0)))  # see `powers`
+    powers: Float[np.ndarray, "stretch value"] = field(default_factory=lambda: np.zeros((0, 0)))  # see `_activity`
     stretches: Int[np.ndarray, " stretch"] = field(default_factory=lambda: np.zeros(0, int))
 
     def precision_of(self, problem: Problem, combination: Combination) -> Float[np.ndarray, " z"]:

@@ -140,8 +140,10 @@ def _fitted(
     some = [one.middle(np.append(1.0, off[problem.local(k)])) for k, one in enumerate(pieces)]
     grid = grid_of([one.times for one in pieces], _DAMPINGS, _TIMES)
     largest = REMAINDER * float(np.nanstd(np.concatenate([r.readings[:, j] for r in problem.rows])))
-    first = _values(some, np.array([[_shape(one) for one in both] for both in begins]), known, largest)
-    both = list(begins[int(np.argmax(first))])
+    both = list(begins[0])
+    if len(begins) > 1:  # filled up to the grid's number of points, whose program is compiled already
+        shapes = np.resize([[_shape(one) for one in pair] for pair in begins], (len(grid) + 1, 2, 3))
+        both = list(begins[int(np.argmax(_values(some, shapes, known, largest)[: len(begins)]))])
     for turn in range(_TURNS):
         searched = 1 - turn % 2
         tried = np.append(grid, [_shape(both[searched])], axis=0)

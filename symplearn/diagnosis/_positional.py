@@ -64,7 +64,7 @@ class _Channel:
         rest = self.columns[self.plain :]
         spread = np.linalg.inv(rest @ rest.T + np.eye(len(rest)) * len(rest) / ratio)
         mean = spread @ (rest @ (column @ self.columns[: self.plain]))
-        square = np.einsum("ir,ij,jr->", rest, spread, rest) / max(float((rest[0] ** 2).sum()), 1e-300)
+        square = float((rest * (spread @ rest)).sum()) / max(float((rest[0] ** 2).sum()), 1e-300)
         return Bend(*self.ends, mean, noise * float(np.sqrt(max(square, 0.0))))
 
 
