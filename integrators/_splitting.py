@@ -12,6 +12,9 @@ from jaxtyping import Array, Float
 from integrators._integrator import AbstractIntegrator
 from integrators._system import AbstractHamiltonian, System, Time, as_parameter, conservative, split
 
+# (q, p, x, y): the coordinates and momenta of both copies.
+_Copies = tuple[Array, Array, Array, Array]
+
 
 class AbstractVerlet(AbstractIntegrator):
     """Kick and drift in turns, for H = T(p) + U(q), symmetric about the middle of the step."""
@@ -167,28 +170,48 @@ class Tao(AbstractIntegrator):
         q, p, x, y = jnp.split(state, 4)
         early, late = hamiltonian.at(t + 0.25 * dt), hamiltonian.at(t + 0.75 * dt)
         # H(q, y) moves p and x; H(x, p) moves q and y; the binding turns the differences of the copies.
-        dx, dp = _push(early, q, y, dt)
-        x, p = x + dx, p + dp
+        dx, dp = _push(early, q, y, 0.5 * dt)
+        middle = (hamiltonian.at(t + 0.5 * dt),) * 2 if self.omega is None else (early, late)
+        q, p, x, y = self._middle(*middle, (q, p + dp, x + dx, y), dt)
+        dx, dp = _push(late, q, y, 0.5 * dt)
+        return jnp.concatenate([q, p + dp, x + dx, y])
+
+    def march(
+        self, system: System, state: Float[Array, "n ..."], t: Time, dt: Time, steps: int
+    ) -> Float[Array, "n ..."]:
+        hamiltonian = conservative(system)
+        if hamiltonian is None or not hamiltonian.stands_still:
+            return super().march(system, state, t, dt, steps)
+        q, p, x, y = jnp.split(state, 4)
+        dx, dp = _push(hamiltonian, q, y, 0.5 * dt)
+
+        # What H(q, y) does at the end of a step and at the beginning of the next is one.
+        def one(copies: _Copies, share: Any) -> tuple[_Copies, None]:
+            q, p, x, y = self._middle(hamiltonian, hamiltonian, copies, dt)
+            dx, dp = _push(hamiltonian, q, y, share * dt)
+            return (q, p + dp, x + dx, y), None
+
+        shares = np.where(np.arange(steps) < steps - 1, 1.0, 0.5)
+        return jnp.concatenate(jax.lax.scan(one, (q, p + dp, x + dx, y), shares)[0])
+
+    def _middle(self, early: AbstractHamiltonian, late: AbstractHamiltonian, copies: _Copies, dt: Time) -> _Copies:
+        """The middle of a step: H(x, p) on both sides of the binding, or all at once where nothing binds."""
+        q, p, x, y = copies
         if self.omega is None:
-            dq, dy = _push(hamiltonian.at(t + 0.5 * dt), x, p, 2.0 * dt)
-            q, y = q + dq, y + dy
-            dx, dp = _push(late, q, y, dt)
-            return jnp.concatenate([q, p + dp, x + dx, y])
-        dq, dy = _push(early, x, p, dt)
-        q, y = q + dq, y + dy
-        q, p, x, y = _bind(q, p, x, y, 2.0 * self.omega * dt)
-        dq, dy = _push(late, x, p, dt)
-        q, y = q + dq, y + dy
-        dx, dp = _push(late, q, y, dt)
-        x, p = x + dx, p + dp
-        return jnp.concatenate([q, p, x, y])
+            dq, dy = _push(early, x, p, dt)
+            return q + dq, p, x, y + dy
+        dq, dy = _push(early, x, p, 0.5 * dt)
+        q, p, x, y = _bind(q + dq, p, x, y + dy, 2.0 * self.omega * dt)
+        dq, dy = _push(late, x, p, 0.5 * dt)
+        return q + dq, p, x, y + dy
 
 
 def _push(
     hamiltonian: AbstractHamiltonian, q: Float[Array, "d ..."], p: Float[Array, "d ..."], dt: Time
 ) -> tuple[Float[Array, "d ..."], Float[Array, "d ..."]]:
-    """The way that half a step of H(q, p), both frozen, carries the other copy's coordinates and momenta."""
-    return split(0.5 * dt * hamiltonian.vector_field(jnp.concatenate([q, p])))
+    """The way that H(q, p), both frozen, carries the other copy's coordinates and momenta in `dt`."""
+    velocity, force = hamiltonian.velocity_and_force(q, p)
+    return dt * velocity, dt * force
 
 
 def _bind(

@@ -56,6 +56,12 @@ class AbstractHamiltonian(eqx.Module):
         q, p = split(x)
         return jnp.concatenate([self.velocity(q, p), -self.slope(q, p)])
 
+    def velocity_and_force(
+        self, q: Float[Array, "d ..."], p: Float[Array, "d ..."]
+    ) -> tuple[Float[Array, "d ..."], Float[Array, "d ..."]]:
+        """dq/dt and dp/dt at once, the two halves of `vector_field`."""
+        return split(self.vector_field(jnp.concatenate([q, p])))
+
     def at(self, t: Time) -> "AbstractHamiltonian":
         """The system as it stands at time `t`. A time-dependent one returns a copy with its time replaced."""
         return self

@@ -16,10 +16,10 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._errors import InputError
 from ._faults import SENTENCES, Fault, is_fatal
-from ._filter_step import AbstractPassage, begin, measure
+from ._filter_step import AbstractPassage, begin, measure, unscored
 from ._guard import guard
 from ._model import AbstractAffine, AbstractStateSpaceModel, StateSpaceModel, slice_at
-from ._transforms import STANDARD, AbstractTransform, Taylor
+from ._transforms import STANDARD, AbstractTransform, Moments, Taylor
 
 # Bytes of the states of all readings beyond which a gradient does not keep all of them, but takes a third longer.
 _KEPT = 2_000_000
@@ -67,25 +67,32 @@ class Sequential(AbstractPassage):
 
     def run(self, model, readings, intervals, contexts, transform, keep):
         model, readings, intervals, contexts = guard((model, readings, intervals, contexts))
-        carry, first = begin(model, transform, readings[0], slice_at(contexts, 0))
+        if len(readings) == 1:
+            carry, record = begin(model, transform, readings[0], slice_at(contexts, 0))
+            return carry, jax.tree.map(lambda leaf: leaf[None], record)
 
         def step(carry, data):
             reading, interval, context, k = data
             inside, carry = guard((model, carry))
-            predicted = inside.predict(transform, carry.mean, carry.root, interval)
+            later = functools.partial(inside.predict, transform, carry.mean, carry.root, interval)
+            # The first reading goes through the loop as well: outside of it, kernel by kernel, it would take as long
+            # as thirty inside.
+            first = functools.partial(_as_it_is, carry, jax.eval_shape(later))
+            predicted = jax.lax.cond(k == 0, first, later)
             carry, record = measure(inside, transform, carry, predicted, reading, context, k)
             return carry, (record if keep else None)
 
         # Checkpointing the step makes the gradient faster as well as 16 times smaller (performance.md, A7).
         step = jax.checkpoint(step, prevent_cse=False)
+        carry, records = unscored(jnp.asarray(model.initial.mean), model.initial.root), None
         if keep or len(readings) * sum(leaf.nbytes for leaf in carry) <= _KEPT:
-            later_contexts = jax.tree.map(lambda leaf: leaf[1:], contexts)
-            data = readings[1:], intervals, later_contexts, np.arange(1, len(readings))
-            carry, later = jax.lax.scan(step, carry, data)
+            # The first interval stands for the one before the first reading, of which nothing is used.
+            before = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:1], leaf]), intervals)
+            carry, records = jax.lax.scan(step, carry, (readings, before, contexts, np.arange(len(readings))))
         else:
-            carry, later = _in_stretches(step, carry, (readings, contexts), intervals), None
+            carry = _in_stretches(step, carry, (readings, contexts), intervals)
         # What a last step leaves in the tangents is past every guard inside.
-        return carry._replace(log_likelihood=guard(carry.log_likelihood)), first, later
+        return carry._replace(log_likelihood=guard(carry.log_likelihood)), records
 
 
 SEQUENTIAL = Sequential()
@@ -109,10 +116,9 @@ def unscented_filter(
 
     Works under `jit`, `vmap`, `jacfwd` and `grad`. A failure is a value: see `Filtered.fault`; derivatives are then 0.
     """
-    carry, first, later = passage.run(model, readings, intervals, contexts, transform, keep=True)
-    history = [jnp.concatenate([one[None], rest]) for one, rest in zip(first, later, strict=True)]
+    carry, records = passage.run(model, readings, intervals, contexts, transform, keep=True)
     # The fields of `Record` are those of `Filtered` between the first and the faults.
-    return Filtered(*(carry.log_likelihood, *history, carry.fault, carry.fault_step))
+    return Filtered(*(carry.log_likelihood, *records, carry.fault, carry.fault_step))
 
 
 def log_likelihood(
@@ -152,6 +158,12 @@ def kalman_filter(
     return unscented_filter(model, readings, intervals, contexts, Taylor(), passage)
 
 
+def _as_it_is(carry, shape):
+    """The state as moments of the shape of a prediction: more columns, of zeros."""
+    wide = jnp.pad(carry.root, ((0, 0), (0, shape.factor.shape[1] - carry.root.shape[1])))
+    return Moments(carry.mean, wide, jnp.zeros(shape.source.shape, shape.source.dtype))
+
+
 def _in_stretches(step, carry, of_readings, intervals):
     """The carry after all readings; derivatives keep only that at the start of every stretch of sqrt(n) readings.
 
@@ -172,4 +184,4 @@ def _in_stretches(step, carry, of_readings, intervals):
         after, _ = step(carry, data)
         return jax.tree.map(lambda new, old: jnp.where(data[-1] < count, new, old), after, carry), None
 
-    return jax.lax.scan(stretch, carry, np.arange(1, count, length))[0]
+    return jax.lax.scan(stretch, carry, np.arange(0, count, length))[0]

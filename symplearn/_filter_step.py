@@ -53,9 +53,9 @@ class AbstractPassage(eqx.Module):
         contexts: PyTree,
         transform: AbstractTransform,
         keep: bool,
-    ) -> tuple[Carry, Record, Any]:
-        """The state and the score after all readings; the record of the first reading; those of the later ones along a
-        leading axis, or None unless `keep`."""
+    ) -> tuple[Carry, Any]:
+        """The state and the score after all readings; their records along a leading axis, which may be None unless
+        `keep`."""
 
 
 def begin(model, transform, reading, context):

@@ -12,15 +12,18 @@ from jaxtyping import Array, Float
 
 import integrators as ig
 
-from ._small_products import product, product_by_terms
+from ._small_products import product
+
+# Terms of a gradient up to which they are written out one by one; compiling takes longer with each.
+_WRITTEN_OUT = 128
 
 
 class AbstractBasis(eqx.Module):
     """Polynomials B_0 = 1, B_1, ... of one variable, from which products over the variables are made."""
 
     @abc.abstractmethod
-    def values(self, z: Float[Array, "variable ..."], degree: int) -> Float[Array, "power variable ..."]:
-        """B_n(z_i) for n = 0..degree."""
+    def values(self, x: Float[Array, "*shape"], degree: int) -> list[Float[Array, "*shape"]]:
+        """B_n(x) for n = 0..degree, at a variable over its scale."""
 
     @abc.abstractmethod
     def slopes(self, degree: int) -> np.ndarray:
@@ -39,12 +42,11 @@ class AbstractBasis(eqx.Module):
 class Monomials(AbstractBasis):
     """1, z, z^2, ..."""
 
-    def values(self, z: Float[Array, "variable ..."], degree: int) -> Float[Array, "power variable ..."]:
-        # Not `cumprod`, which is a loop of windows that XLA cannot fuse with what is around it.
-        table = [jnp.ones_like(z), z]
+    def values(self, x: Float[Array, "*shape"], degree: int) -> list[Float[Array, "*shape"]]:
+        table = [jnp.ones_like(x), x]
         for n in range(1, degree):
-            table.append(table[n] * z)
-        return jnp.stack(table[: degree + 1])
+            table.append(table[n] * x)
+        return table[: degree + 1]
 
     def slopes(self, degree: int) -> np.ndarray:
         return np.diag(np.arange(1.0, degree + 1), k=-1)
@@ -70,12 +72,11 @@ class Legendre(AbstractBasis):
     def scales(self, variables: int) -> Float[Array, " variable"]:
         return jnp.broadcast_to(jnp.asarray(self.box, dtype=float), (variables,))
 
-    def values(self, z: Float[Array, "variable ..."], degree: int) -> Float[Array, "power variable ..."]:
-        x = z / self.scales(z.shape[0]).reshape(-1, *[1] * (z.ndim - 1))
+    def values(self, x: Float[Array, "*shape"], degree: int) -> list[Float[Array, "*shape"]]:
         table = [jnp.ones_like(x), x]
         for n in range(1, degree):
             table.append(((2 * n + 1) * x * table[n] - n * table[n - 1]) / (n + 1))
-        return jnp.stack(table[: degree + 1])
+        return table[: degree + 1]
 
     def slopes(self, degree: int) -> np.ndarray:
         # P_n' = sum of (2 m + 1) P_m over m = n - 1, n - 3, ...
@@ -117,20 +118,24 @@ def _derivative_table(basis: AbstractBasis, variables: int, degree: int) -> np.n
     return table
 
 
-def _products(basis: AbstractBasis, z: Array, degree: int) -> Array:
-    """All products of total degree 0..`degree` at z, in the order of `_grown_exponents`.
+def _products(basis: AbstractBasis, variables: list[Array], degree: int) -> list[Array]:
+    """All products of total degree 0..`degree` of the variables, in the order of `_grown_exponents`.
 
-    Grown from those of the later variables, by slices alone: a gather's derivative is a scatter, which is slow, and the
-    derivative of `prod` divides by zero.
+    One array each, grown from those of the later variables: a loop over an array of all of them could not be
+    vectorised, since each entry is made in another way; the derivative of a gather is a scatter, which is slow, and
+    that of `prod` divides by zero.
     """
-    values, made = basis.values(z, degree), {}
-    for left in range(degree + 1):
-        made[left] = values[: left + 1, -1]
-    for i in reversed(range(z.shape[0] - 1)):
-        made = {
-            left: jnp.concatenate([made[left], *(values[k, i] * made[left - k] for k in range(1, left + 1))])
-            for left in range(degree + 1)
-        }
+    scales = basis.scales(len(variables))
+    made: list[list[Array]] = []
+    for i in reversed(range(len(variables))):
+        powers = basis.values(variables[i] / scales[i], degree)
+        if i == len(variables) - 1:
+            made = [powers[: left + 1] for left in range(degree + 1)]
+        else:
+            made = [
+                made[left] + [powers[k] * rest for k in range(1, left + 1) for rest in made[left - k]]
+                for left in range(degree + 1)
+            ]
     return made[degree]
 
 
@@ -142,20 +147,37 @@ def _places(variables: int, degree: int) -> np.ndarray:
 
 
 def _polynomial(basis: AbstractBasis, coefficients: Array, z: Array, degree: int) -> Array:
-    return product(coefficients, _products(basis, z, degree)[_places(z.shape[0], degree)])
+    return product(coefficients, jnp.stack(_products(basis, list(z), degree))[_places(z.shape[0], degree)])
 
 
-def _weights(basis: AbstractBasis, coefficients: Array, variables: int, degree: int) -> Array:
-    """What the gradient's components (variable, lower term) are made of: the same all along a trajectory."""
-    table = jnp.sum(jnp.asarray(_derivative_table(basis, variables, degree)) * coefficients, axis=-1)
-    return table / basis.scales(variables)[:, None]
+def _weights(basis: AbstractBasis, coefficients: Array, variables: int, degree: int) -> Any:
+    """What the gradient's components are made of, the same all along a trajectory: an array (variable, lower term), or,
+    where there are few, a list of dictionaries from lower terms to numbers."""
+    table, scales = _derivative_table(basis, variables, degree), basis.scales(variables)
+    if table.shape[1] * variables > _WRITTEN_OUT:
+        return jnp.sum(jnp.asarray(table) * coefficients, axis=-1) / scales[:, None]
+    return [
+        {
+            k: sum(float(row[k, m]) * coefficients[m] for m in np.flatnonzero(row[k])) / scales[i]
+            for k in np.flatnonzero(row.any(axis=1)).tolist()
+        }
+        for i, row in enumerate(table)
+    ]
+
+
+def _gradient(basis: AbstractBasis, weights: Any, variables: list[Array], degree: int) -> list[Array]:
+    """The gradient of a polynomial of such weights: sums of products for each component, written out if few."""
+    products = _products(basis, variables, degree - 1)
+    if not isinstance(weights, list):
+        return list(weights @ jnp.stack(products))
+    return [sum(weight * products[k] for k, weight in row.items()) for row in weights]
 
 
 class _PreparedPotential(ig.AbstractSeparableHamiltonian):
     """A polynomial potential with its gradient's weights worked out."""
 
     of: "PolynomialPotential"
-    weights: Float[Array, "variable term"]
+    weights: Any
 
     side_by_side: ClassVar[bool] = True
 
@@ -169,14 +191,14 @@ class _PreparedPotential(ig.AbstractSeparableHamiltonian):
         return p
 
     def slope(self, q: Float[Array, "d ..."], p: Float[Array, "d ..."]) -> Float[Array, "d ..."]:
-        return product_by_terms(self.weights, _products(self.of.basis, q, self.of.degree - 1))
+        return jnp.stack(_gradient(self.of.basis, self.weights, list(q), self.of.degree))
 
 
 class _Prepared(ig.AbstractHamiltonian):
     """A polynomial with its gradient's weights worked out."""
 
     of: "Polynomial"
-    weights: Float[Array, "variable term"]
+    weights: Any
 
     side_by_side: ClassVar[bool] = True
 
@@ -184,15 +206,21 @@ class _Prepared(ig.AbstractHamiltonian):
         return self.of.energy(q, p)
 
     def velocity(self, q: Float[Array, "d ..."], p: Float[Array, "d ..."]) -> Float[Array, "d ..."]:
-        return self.vector_field(jnp.concatenate([q, p]))[: self.of.dim]
+        return self.velocity_and_force(q, p)[0]
 
     def slope(self, q: Float[Array, "d ..."], p: Float[Array, "d ..."]) -> Float[Array, "d ..."]:
-        return -self.vector_field(jnp.concatenate([q, p]))[self.of.dim :]
+        return -self.velocity_and_force(q, p)[1]
 
     def vector_field(self, x: Float[Array, "two_d ..."]) -> Float[Array, "two_d ..."]:
         """dx/dt at the phase point x, by one gradient."""
-        slope, velocity = ig.split(product_by_terms(self.weights, _products(self.of.basis, x, self.of.degree - 1)))
-        return jnp.concatenate([velocity, -slope])
+        return jnp.concatenate(self.velocity_and_force(*ig.split(x)))
+
+    def velocity_and_force(
+        self, q: Float[Array, "d ..."], p: Float[Array, "d ..."]
+    ) -> tuple[Float[Array, "d ..."], Float[Array, "d ..."]]:
+        """dq/dt and dp/dt, by one gradient."""
+        slopes, d = _gradient(self.of.basis, self.weights, [*q, *p], self.of.degree), self.of.dim
+        return jnp.stack(slopes[d:]), -jnp.stack(slopes[:d])
 
 
 def _terms(basis: AbstractBasis, names: list[str], degree: int) -> tuple[str, ...]:

@@ -51,8 +51,8 @@ class ParallelInTime(AbstractPassage):
         steps = jax.vmap(jax.checkpoint(lambda *data: _step(model, *data)))
         after, records = steps(*before, good, *later, np.arange(1, len(readings)))
         carry, increments = _added_up(jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, after))
-        one, records = one._replace(increment=increments[0]), records._replace(increment=increments[1:])
-        return carry, one, (records if keep else None)
+        records = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), one, records)
+        return carry, records._replace(increment=increments)
 
 
 class _Element(NamedTuple):

@@ -1,8 +1,8 @@
 """Products of small matrices, written so that XLA puts them into the loop around them.
 
-On a CPU each `@`, and in a batch each sum along an axis, is a call of a library, of a microsecond or so, and a loop
-with a call in it is not compiled as one function (see `_loops`). For the few numbers of a filter's step sums are the
-faster way by far; for large matrices the library is.
+On a CPU each `@` is a call of a library, of a microsecond or so, and a loop with a call in it is not compiled as one
+function (see `_loops`). For the few numbers of a filter's step sums are the faster way by far; for large matrices the
+library is.
 """
 
 import jax
@@ -21,26 +21,24 @@ def product(left: Float[Array, "... inner"], right: Float[Array, " inner *column
         return left @ right
     if right.ndim == 1:
         return jnp.sum(left * right, axis=-1)
-    return jnp.sum(left[..., None] * right, axis=-2)
+    if left.ndim == 1:
+        return jnp.sum(left[:, None] * right, axis=0)
+    dtype = jnp.result_type(left, right)
+    return _product.bind(left.astype(dtype), right.astype(dtype))
 
 
-def product_by_terms(left: Float[Array, "row inner"], right: Float[Array, " inner *column"]) -> Float[Array, "row ..."]:
-    """left @ right without a sum along an axis, which in a batch of many is a call of a library again.
+def _written(left, right):
+    """A sum along an axis for two matrices; term by term for as many on either side.
 
-    For few terms in an innermost loop. In the filter's step, where others take the result, it is slower.
+    XLA makes a sum an own loop for each entry. Of one pair that is unrolled and fast; of a batch it waits for every
+    addition, eight times as long as a term's products of all pairs together.
     """
-    if max(left.shape + right.shape) > SMALL:
-        return left @ right
-    dtype, columns = jnp.result_type(left, right), right.reshape(right.shape[0], -1)
-    return _product.bind(left.astype(dtype), columns.astype(dtype)).reshape(left.shape[0], *right.shape[1:])
-
-
-def _term_by_term(left, right):
-    """Of matrices, or of as many on either side."""
-    total = left[..., :, :1] * right[..., :1, :]
+    if left.ndim == 2:
+        return jnp.sum(left[:, :, None] * right, axis=1)
+    total = left[..., :1] * right[..., :1, :]
     for k in range(1, left.shape[-1]):
-        total = total + left[..., :, k : k + 1] * right[..., k : k + 1, :]
-    return total
+        total = total + left[..., k : k + 1] * right[..., k : k + 1, :]
+    return jax.lax.optimization_barrier(total)
 
 
 def _transposed(matrix):
@@ -57,11 +55,11 @@ def _batched(arguments, axes):
     return _product.bind(*both), 0
 
 
-# A primitive, because JAX's own derivative of a product written term by term is a sum along axes.
+# A primitive, because it is written in another way in a batch, and JAX's own derivative of terms is a sum along axes.
 _product = Primitive("small_product")
-_product.def_impl(jax.jit(_term_by_term))
+_product.def_impl(jax.jit(_written))
 _product.def_abstract_eval(lambda left, right: jax.core.ShapedArray((*left.shape[:-1], right.shape[-1]), left.dtype))
-mlir.register_lowering(_product, mlir.lower_fun(_term_by_term, multiple_results=False))
+mlir.register_lowering(_product, mlir.lower_fun(_written, multiple_results=False))
 ad.defbilinear(
     _product,
     lambda cotangent, left, right: _product.bind(cotangent, _transposed(right)),

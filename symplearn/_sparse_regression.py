@@ -51,7 +51,7 @@ class PolynomialLibrary(eqx.Module):
         return tuple(" ".join(row) or "1" for row in factors)
 
     def __call__(self, x: Float[Array, " dim"]) -> Float[Array, " term"]:
-        powers, values = exponents(self.dim, self.degree, 0), MONOMIALS.values(x, self.degree)
+        powers, values = exponents(self.dim, self.degree, 0), jnp.stack(MONOMIALS.values(x, self.degree))
         return functools.reduce(jnp.multiply, [values[powers[:, i], i] for i in range(self.dim)])
 
 

@@ -11,7 +11,7 @@ from integrators.problems import HarmonicOscillator, HenonHeiles
 from symplearn import _filter
 from symplearn._log_posterior import gradient, guarded
 from symplearn._model import intervals_between
-from symplearn._small_products import SMALL, product, product_by_terms
+from symplearn._small_products import SMALL, product
 
 
 def assert_same_in_value_and_derivatives(fast, plain, at):
@@ -33,20 +33,19 @@ def test_a_small_product_is_the_product(left, right):
     )
 
 
-@pytest.mark.parametrize("right", [(3,), (3, 4)])
-def test_a_product_by_terms_is_the_product(right):
-    """Alone and in a batch, of one side or of both, in forward and in reverse mode, by both sides."""
+def test_a_batch_of_small_products_is_their_products():
+    """Of one side or of both, in forward and in reverse mode, by either side, and a batch of batches."""
     random = np.random.default_rng(0)
-    left, right = jnp.asarray(random.normal(size=(5, 2, 3))), jnp.asarray(random.normal(size=(5, *right)))
+    left, right = (jnp.asarray(random.normal(size=shape)) for shape in ((5, 2, 3), (5, 3, 4)))
     for fast, plain in (
-        (lambda x: product_by_terms(x[0], right[0]), lambda x: x[0] @ right[0]),
-        (lambda x: jax.vmap(product_by_terms)(x, right), lambda x: jax.vmap(jnp.matmul)(x, right)),
-        (lambda x: jax.vmap(product_by_terms, (0, None))(x, right[1]), lambda x: x @ right[1]),
+        (lambda x: jax.vmap(product)(x, right), lambda x: x @ right),
+        (lambda x: jax.vmap(product, (0, None))(x, right[1]), lambda x: x @ right[1]),
+        (lambda x: jax.vmap(jax.vmap(product, (None, 0)), (0, None))(x, right), lambda x: x[:, None] @ right),
     ):
         assert_same_in_value_and_derivatives(fast, plain, left)
         # Round-off of three terms, with room for another order of additions; so below.
         np.testing.assert_allclose(jax.jacfwd(fast)(left), jax.jacfwd(plain)(left), rtol=1e-12, atol=1e-12)
-    by_right = (jax.jacrev(jax.vmap(f, (None, 0)), 1)(left[0], right) for f in (product_by_terms, jnp.matmul))
+    by_right = (jax.jacrev(jax.vmap(f, (None, 0)), 1)(left[0], right) for f in (product, jnp.matmul))
     np.testing.assert_allclose(*by_right, rtol=1e-12, atol=1e-12)
 
 
@@ -65,26 +64,33 @@ class Driven(ig.AbstractSeparableHamiltonian):
         return Driven(t)
 
 
+_FORCES = (ig.ViscousDamping(0.3), ig.CoulombFriction(0.1))
+
+
 @pytest.mark.parametrize(
-    "system",
+    ("system", "integrator"),
     [
-        HenonHeiles(),
-        ig.Forced(HenonHeiles()),
-        ig.Forced(HenonHeiles(), (ig.ViscousDamping(0.3), ig.CoulombFriction(0.1))),
-        Driven(),
+        pytest.param(HenonHeiles(), ig.Leapfrog(), id="alone"),
+        pytest.param(ig.Forced(HenonHeiles()), ig.Leapfrog(), id="without forces"),
+        pytest.param(ig.Forced(HenonHeiles(), _FORCES), ig.Leapfrog(), id="with forces"),
+        pytest.param(Driven(), ig.Leapfrog(), id="changing in time"),
+        pytest.param(HenonHeiles(), ig.Tao(3.0), id="Tao"),
+        pytest.param(HenonHeiles(), ig.Tao(None), id="Tao, unbound"),
+        pytest.param(ig.Forced(HenonHeiles(), _FORCES[:1]), ig.Tao(3.0), id="Tao, forced", marks=pytest.mark.slow),
     ],
-    ids=["alone", "without forces", "with forces", "changing in time"],
 )
-def test_leapfrog_over_many_steps_is_its_steps(system):
-    """Half kicks that meet are one force, where that is the same: not with friction, nor where the system changes."""
+def test_many_steps_are_the_steps_one_by_one(system, integrator):
+    """What ends a step and what begins the next are done at once, where that is the same: not with friction, nor where
+    the system changes."""
 
     def steps(x):
+        x = integrator.lift(x)
         for k in range(3):
-            x = ig.Leapfrog().step(system, x, 0.5 + 0.2 * k, 0.2)
-        return x
+            x = integrator.step(system, x, 0.5 + 0.2 * k, 0.2)
+        return integrator.project(x)
 
     start = jnp.array([0.2, -0.25, 0.3, -0.25])
-    assert_same_in_value_and_derivatives(lambda x: ig.advance(system, ig.Leapfrog(), x, 0.5, 1.1, 3), steps, start)
+    assert_same_in_value_and_derivatives(lambda x: ig.propagate(system, integrator, x, 0.5, 1.1, 3), steps, start)
 
 
 @pytest.mark.parametrize(
