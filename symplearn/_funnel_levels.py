@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import logsumexp, ndtri
 from scipy.stats import qmc
 
-from ._importance import softened
+from ._importance import kish, softened
 from ._log_posterior import gradient
 from ._noise import AdditiveGaussian
 from ._parameters import flatten, resolve
@@ -29,15 +29,17 @@ _FARTHEST = 4.0
 _AT_REST = 0.05
 # Lengths of a step of Newton's method that are tried, each half the one before.
 _LENGTHS = 8
-# Draws by which a level is weighed, in how many rounds, how much wider than it, and the least effective number of them.
-_DRAWS, _ROUNDS, _WIDER, _LEAST = 512, 3, 1.1, 5.0
+# Draws a level is weighed by, in how many rounds at most, how much wider than it, the least effective number, and the
+# share of effective ones from which on another round changes little.
+_DRAWS, _ROUNDS, _WIDER, _LEAST, _FITS = 512, 3, 1.1, 5.0, 1 / 3
 # Places that are looked at together.
 _CHUNK = 64
 
 
 class Level(NamedTuple):
     """One level of log Sigma: the optimum there, `mode`, and Laplace's root of the covariance, `laplace`; mean and root
-    of the mass itself; how the logarithms of the widths grow along one width of log Gamma; and the log of the mass."""
+    of the mass itself; how the logarithms of the widths grow along one width of log Gamma; the log of the mass; and
+    whether a normal of that mean and root came near the mass."""
 
     s: float
     mode: np.ndarray
@@ -46,6 +48,7 @@ class Level(NamedTuple):
     root: np.ndarray
     growth: np.ndarray
     mass: float = 0.0
+    fits: bool = False
 
 
 class Walk:
@@ -100,10 +103,15 @@ class Walk:
             if tried[best] > value:
                 place = place + lengths[best] * step
         growth = self._growth(place, root)
-        # exp(-x^2 / 2) times the volume, which grows as exp(sum(growth) x), is the greatest at x = sum(growth).
-        middle = min(float(np.sum(growth)), _FARTHEST)
-        mode = place[1:]
-        level = Level(float(place[0]), mode, root, mode + root[:, 0] * middle, root * np.exp(growth * middle), growth)
+        s, mode = float(place[0]), place[1:]
+        if last is not None and last.fits:
+            # What the draws said of the level before is most of what they will say of this one.
+            moved = root @ np.linalg.inv(last.laplace)
+            level = Level(s, mode, root, mode + moved @ (last.mean - last.mode), moved @ last.root, growth)
+        else:
+            # exp(-x^2 / 2) times the volume, which grows as exp(sum(growth) x), is the greatest at x = sum(growth).
+            middle = min(float(np.sum(growth)), _FARTHEST)
+            level = Level(s, mode, root, mode + root[:, 0] * middle, root * np.exp(growth * middle), growth)
         return self._weighed(level, _ROUNDS)
 
     def _weighed(self, level: Level, rounds: int) -> Level | None:
@@ -122,8 +130,9 @@ class Walk:
             mean=level.mean + level.root @ (weights @ z),
             root=level.root @ np.linalg.cholesky(shrunk(z, weights)),
             mass=float(logsumexp(log_weights)),
+            fits=kish(log_weights) >= _FITS * len(z),
         )
-        return level if rounds == 1 else self._weighed(level, rounds - 1)
+        return level if level.fits or rounds == 1 else self._weighed(level, rounds - 1)
 
     def _growth(self, place: np.ndarray, root: np.ndarray) -> np.ndarray:
         """How the logarithms of the widths grow over one width of log Gamma."""
@@ -135,16 +144,10 @@ class Walk:
         if not np.all(np.isfinite(hessian)):
             return none
         # More noise cannot tell more, and widths do not grow faster than it; all else is the likelihood's own bend.
-        most = max(self._log_noise(shifted) - self._log_noise(place), 0.0)
+        before, after = _log_noise(self.density, self.axes, np.stack([place, shifted]))
+        most = max(float(after - before), 0.0)
         grown = np.clip(np.log(np.diagonal(self._root(hessian)) / np.diagonal(root)), 0.0, most)
         return np.concatenate([[0.0], grown[1:]])
-
-    def _log_noise(self, place: np.ndarray) -> float:
-        """The logarithm of the measurement noise's standard deviation, the mean of its directions."""
-        noise = resolve(flatten(self.density.model)[1](jnp.asarray(self.axes @ place))).measurement_noise
-        if not isinstance(noise, AdditiveGaussian):
-            return float(place[1])
-        return float(0.5 * np.linalg.slogdet(np.asarray(noise.covariance()))[1] / len(noise.covariance()))
 
     def _values(self, places: np.ndarray) -> np.ndarray:
         """The log posterior at some places, -inf where it is not a number; in chunks of one size, compiled once."""
@@ -181,6 +184,20 @@ def _normal(size: int) -> np.ndarray:
     """Points (draw, parameter) that fill a standard normal evenly, the same ones at every level."""
     # Scrambled, by a number that is part of the rule: unscrambled the first of Sobol's points is at 0.
     return ndtri(qmc.Sobol(size, rng=0).random(_DRAWS))
+
+
+@eqx.filter_jit
+def _log_noise(density, axes, places):
+    """The logarithm of the measurement noise's standard deviation at each place, the mean of its directions."""
+    rebuild = flatten(density.model)[1]
+
+    def one(place):
+        noise = resolve(rebuild(axes @ place)).measurement_noise
+        if not isinstance(noise, AdditiveGaussian):
+            return place[1]
+        return 0.5 * jnp.linalg.slogdet(noise.covariance())[1] / len(noise.covariance())
+
+    return jax.vmap(one)(places)
 
 
 @eqx.filter_jit

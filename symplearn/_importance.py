@@ -5,7 +5,6 @@ import math
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
@@ -15,7 +14,7 @@ from ._arviz import pareto_k
 from ._blocks import Course
 from ._errors import InputError
 from ._rounds import Rounds
-from ._sampler import NEGLIGIBLE, AbstractBlockSampler, Drawn, LogDensity, generator, refuse_counts, whitened
+from ._sampler import NEGLIGIBLE, AbstractBlockSampler, Drawn, LogDensity, at_each, generator, refuse_counts, whitened
 from ._student_mixture import StudentMixture, refined, shrunk
 from ._whitening import Whitening
 
@@ -183,7 +182,7 @@ def densities(density: LogDensity, start: Whitening, z: np.ndarray) -> np.ndarra
 
 @eqx.filter_jit
 def _densities(density, start, z):
-    return jax.vmap(whitened(density, start))(z)
+    return at_each(whitened(density, start), z)
 
 
 def _first(options: AdaptiveImportance, size: int) -> StudentMixture:

@@ -20,6 +20,8 @@ LogDensity = Callable[[Any], Any]
 # Where no importance weight has a larger share, a few odd ones among near-equal weights can make a Pareto k large, but
 # no mean feels them.
 NEGLIGIBLE = 1e-3
+# Places whose log densities a processor computes together: with 128 of Henon-Heiles each took 1.5 times as long.
+_TOGETHER = 64
 
 
 class Drawn(eqx.Module):
@@ -93,6 +95,15 @@ def whitened(density: LogDensity, start: Whitening, slopes: bool = False) -> Log
         return log_density
     minus = guarded(lambda z: -log_density(z), start.centre.shape[0])
     return lambda z: -minus(z)
+
+
+def at_each(density: LogDensity, places: Float[Array, "place parameter"]) -> Float[Array, " place"]:
+    """The log density at each place: on a processor so many at a time as stay in its cache."""
+    count = len(places)
+    together = min(count, _TOGETHER) if jax.default_backend() == "cpu" else count
+    filled = jnp.concatenate([places, jnp.tile(places[-1:], (-count % together, 1))])
+    parts = filled.reshape(-1, together, places.shape[1])
+    return jax.lax.map(jax.vmap(density), parts).reshape(-1)[:count]
 
 
 def refuse_counts(sampler: AbstractSampler, **least: int) -> None:

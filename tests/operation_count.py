@@ -17,7 +17,8 @@ _SUMS = {"reduce_sum", "reduce_max", "reduce_min", "reduce_prod"}
 _FREE = set(
     """broadcast_in_dim reshape transpose concatenate slice dynamic_slice squeeze select_n iota eq ne lt le gt ge and or
     not is_finite convert_element_type gather scatter pad rev reduce_and reduce_or stop_gradient copy sign split
-    dynamic_update_slice expand_dims copy_p finite_or_zero platform_index clamp""".split()
+    dynamic_update_slice expand_dims copy_p finite_or_zero platform_index clamp
+    stack optimization_barrier""".split()
 )
 
 
@@ -42,6 +43,8 @@ def _cost(equation) -> int:
         return size * (2 * terms - 1)
     if name in _SUMS:
         return math.prod(equation.invars[0].aval.shape) - size
+    if name == "small_product":
+        return size * (2 * equation.invars[0].aval.shape[-1] - 1)
     if name == "cholesky":
         return equation.invars[0].aval.shape[-1] ** 3 // 3
     if name in _ARITHMETIC:
