@@ -35,8 +35,9 @@ class AbstractHamiltonian(eqx.Module):
     where analytic ones are cheaper. Parameters are array fields, see `as_parameter`.
     """
 
-    # Whether `velocity`, `slope` and `vector_field` also take many points at once, side by side in columns (d, point):
-    # faster than `vmap`, which puts the points first and leaves rows too short for a vector register.
+    # Whether `velocity`, `slope`, `vector_field` and `velocity_and_force` also take many points at once, side by side
+    # in columns (d, point): faster than `vmap`, which puts the points first and leaves rows too short for a vector
+    # register.
     side_by_side: ClassVar[bool] = False
 
     @abc.abstractmethod

@@ -40,8 +40,11 @@ def _orthogonalised(rows: Array) -> tuple[Array, Array, Array]:
 
 @_orthogonalised.defjvp
 def _(primals, tangents):
-    """With M = L^-1 dA Q' the directions turn by T - T', T the transpose of M's strict upper triangle: a tenth of the
-    work of going back through the orthogonalisation. (Walter & Lehmann 2013, for QR, transposed.)"""
+    """With M = L^-1 dA Q' the directions turn by T - T', T the transpose of M's strict upper triangle.
+
+    Walter & Lehmann, arXiv:1001.1654, have it for QR. Going back through the orthogonalisation instead took four times
+    as long in a batch of 64.
+    """
     triangle, directions, good = _orthogonalised(*primals)
     size, inverse = len(good), _inverse(triangle, good)
     along = product(tangents[0], directions.T)
