@@ -123,8 +123,8 @@ def test_moments_of_a_conjugate_posterior(conjugate, sampler):
     posterior = sample(estimate, sampler=sampler, key=jax.random.key(1))
     assert posterior.converged, str(posterior)
     draws = np.asarray(posterior.values["initial.mean"]) - mean
-    # Nine numbers for each of seven samplers: by chance one in six such sets has one of them beyond three standard errors,
-    # one in 250 beyond four. (Of eight keys the random walk's worst were 3.2, 1.5, 1.8, 2.3, 1.2, 0.9, 1.4 and 2.2.)
+    # Nine numbers for each of seven samplers: by chance one in six such sets has one of them beyond three standard
+    # errors, one in 250 beyond four. (Of eight keys the random walk's worst: 3.2, 1.5, 1.8, 2.3, 1.2, 0.9, 1.4, 2.2.)
     for i in range(3):
         assert off_by(draws[..., i], 0.0) < 4.0
         for j in range(i + 1):
