@@ -99,7 +99,7 @@ def test_resumed_from_every_file_is_uninterrupted(name, tmp_path, monkeypatch, e
     monkeypatch.setattr(Checkpoint, "save", kept)
     assert same(drawn(SAMPLERS[name], tmp_path / "at.npz"), uninterrupted(name))
     monkeypatch.setattr(Checkpoint, "save", save)
-    assert len(files) >= 4
+    assert len(files) >= 3  # one to begin from, one in the middle, the last: tempering takes three steps here
     for path in files[:: len(files) // 3]:
         assert same(drawn(SAMPLERS[name], path), uninterrupted(name))
 
