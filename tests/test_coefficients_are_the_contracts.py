@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from symplearn._effects import EFFECTS, Oscillating
+from symplearn.diagnosis._coefficients import _summary
 
 AMOUNT = st.floats(1e-3, 1e3)
 FREQUENCY = st.floats(1e-2, 1e2)
@@ -63,3 +64,13 @@ def test_one_set_of_values_or_many(effect):
     one, many = effect.named(inside, 0.3), effect.named(np.tile(inside, (3, 1)), 0.3)
     for name in effect.coefficients:
         assert float(one[name]) == pytest.approx(0.7) and many[name] == pytest.approx([0.7] * 3)
+
+
+@pytest.mark.parametrize("middle", [0.5, 3.1, -3.1])
+def test_an_interval_of_a_phase_is_about_its_mean(middle):
+    """Where the phase turns over at pi, mean and interval are of the same turn."""
+    draws = np.random.default_rng(0).normal(middle, 0.2, 4000)
+    told = _summary(math.remainder(middle + 0.4, 2 * math.pi), np.angle(np.exp(1j * draws)), circular=True)
+    # Of 4000 draws mean and quantiles are known to 0.003 and 0.008.
+    assert abs(math.remainder(told["mean"] - middle, 2 * math.pi)) < 0.02 and -math.pi < told["mean"] <= math.pi
+    assert told["interval95"] == pytest.approx([told["mean"] - 0.392, told["mean"] + 0.392], abs=0.03)

@@ -7,7 +7,7 @@ from scipy.stats import norm, truncnorm
 
 from .._effects import NOISE, Candidate
 from ._calibrate import Priors
-from ._found import within_signs
+from ._found import within_bounds
 from ._problem import Problem
 from ._weighed import Estimate, Mode
 
@@ -38,7 +38,7 @@ def coefficients(
         return {one.effect.coefficients[0]: _single(problem, estimate, place.start, inflation)}
     draws = _drawn(problem, priors, estimate, place, inflation)
     named = one.effect.named(draws, problem.equations.origin)
-    if within_signs(problem, estimate) is not estimate:  # a step about a fit may end beyond
+    if within_bounds(problem, priors, estimate) is not estimate:  # a step about a fit may end beyond
         values |= {name: float(np.median(named[name])) for name in values if name != "phi"}
     return {name: _summary(values[name], named[name], circular=name == "phi") for name in values}
 
@@ -98,6 +98,8 @@ def _summary(value: float, draws: np.ndarray, circular: bool) -> dict[str, Any]:
         off = np.angle(np.exp(1j * (draws - value)))
         low, high = np.quantile(off, [0.025, 0.975])
         mean = float(np.angle(np.exp(1j * (value + off.mean()))))
-        return {"mean": mean, "sd": float(off.std()), "interval95": [value + float(low), value + float(high)]}
+        # The interval is about that mean, not a turn away from it.
+        ends = [mean + float(end - off.mean()) for end in (low, high)]
+        return {"mean": mean, "sd": float(off.std()), "interval95": ends}
     low, high = np.quantile(draws, [0.025, 0.975])
     return {"mean": value, "sd": float(draws.std()), "interval95": [float(low), float(high)]}

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.optimize import lsq_linear
 from scipy.special import logsumexp
 
 from ._calibrate import Priors
@@ -18,6 +19,8 @@ _APART = 2.0
 _FAR = 3.0
 # Nats that an estimate which did not converge must be ahead to be reported nevertheless.
 _UNCONVERGED = 3.0
+# Directions of a covariance below this share of its longest are round-off.
+_FLATTEST = 1e-12
 
 
 @dataclass(frozen=True)
@@ -42,16 +45,25 @@ def doubtful_outliers(problem: Problem, taken_out: Combination, best: Estimate) 
     return frozenset(j for m, j in columns.items() if m not in best.combination or j in small)
 
 
-def within_signs(problem: Problem, estimate: Estimate) -> Estimate:
-    """The most probable one of those that signs allow: a step about a fit may end beyond, where no friction is."""
-    bounds = problem.lower_bounds(estimate.combination)
-    z, spread, held = estimate.z, estimate.covariance, list[int]()
-    while beyond := [k for k, low in bounds.items() if k not in held and z[k] < low]:
-        held += beyond
-        missing = np.array([bounds[k] for k in held]) - estimate.z[held]
-        z = estimate.z + spread[:, held] @ np.linalg.lstsq(spread[np.ix_(held, held)], missing)[0]
-        z[held] = [bounds[k] for k in held]
-    return estimate if z is estimate.z else replace(estimate, z=z)
+def within_bounds(problem: Problem, priors: Priors, estimate: Estimate) -> Estimate:
+    """The most probable one of those that signs and bounds allow: a step about a fit may end beyond, where no friction
+    is, and no frequency was looked for."""
+    lower, upper = priors.bounds_of(problem, estimate.combination)
+    for k, low in problem.lower_bounds(estimate.combination).items():
+        lower[k] = max(lower[k], low)
+    z, spread = estimate.z, estimate.covariance
+    if np.all((lower <= z) & (z <= upper)):
+        return estimate
+    held = np.flatnonzero((np.isfinite(lower) | np.isfinite(upper)) & (np.diagonal(spread) > 0.0))
+    # All else follows what is held, so that only these are looked for, in their own widths.
+    scales = np.sqrt(np.diagonal(spread)[held])
+    values, vectors = np.linalg.eigh(spread[np.ix_(held, held)] / np.outer(scales, scales))
+    root = (vectors / np.sqrt(np.maximum(values, _FLATTEST * values[-1]))).T / scales
+    found = lsq_linear(root, root @ z[held], (lower[held], upper[held]), method="bvls").x
+    follow = spread[:, held] @ (root.T @ (root @ (found - z[held])))
+    moved = z + follow
+    moved[held] = found
+    return replace(estimate, z=moved)
 
 
 @dataclass
@@ -127,8 +139,9 @@ class Found:
         return replace(white, covariance=white.covariance * white.inflation)
 
     def shown(self, combination: Combination, best: Estimate) -> Estimate:
-        """The estimate to run on: the one that is told, where signs allow it. But a clock that may wander excuses the
-        phase, which a run goes on from; there the best of the others."""
+        """The estimate to run on: the one that is told, as far as its signs and bounds allow. But a clock that may
+        wander excuses the phase, which a run goes on from; there the best of the others."""
         told = self.told(combination, best)
         others = [one for one in self.estimates[combination] if one.kind != told.kind]
-        return within_signs(self.problem, speaker(others) if told.kind == "clock" and others else told)
+        run_on = speaker(others) if told.kind == "clock" and others else told
+        return within_bounds(self.problem, self.priors, run_on)
