@@ -1,12 +1,17 @@
 """Readings that were taken out as outliers and turn out to be none are put back, and all is searched anew."""
 
+from types import SimpleNamespace
+
 import engine_cases as cases
 import numpy as np
 import pytest
 
-from symplearn.diagnosis import Options, diagnose
+from symplearn.diagnosis import Options, _find, diagnose
 from symplearn.diagnosis._build import Restriction
-from symplearn.diagnosis._found import doubtful_outliers
+from symplearn.diagnosis._found import Found, doubtful_outliers
+from symplearn.diagnosis._search import Search
+from symplearn.diagnosis._start import priors_without_effects
+from symplearn.diagnosis._trajectory import Stepper
 from symplearn.diagnosis._weighed import Estimate
 
 CARTS = """
@@ -58,3 +63,40 @@ def test_outliers_are_far_off(said, size, doubtful):
     best = Estimate((names[said],), "white", np.zeros(p.size), np.eye(p.size), np.array([0.5]), 0.0, True,
                     outliers=((0.1, 0.5 * size),))  # fmt: skip
     assert doubtful_outliers(p, (names["sensor_outliers"],), best) == doubtful
+
+
+@pytest.mark.parametrize(
+    ("ahead_of_white", "without", "answer"),
+    [(50.0, 130.0, "without"), (50.0, 80.0, "with"), (2.0, 130.0, "with")],
+    ids=["likelier without them", "likelier with them", "no clear remainder"],
+)
+def test_outliers_beside_a_clear_remainder_are_tried_without(monkeypatch, ahead_of_white, without, answer):
+    """They may be a part of it: the likelier of both searches is the answer. Without a remainder one search is enough.
+
+    An electronic Duffing oscillator had outliers in the place of an offset, which an error of the clock took with it.
+    """
+    times = np.linspace(0.0, 10.0, 50)
+    p = cases.problem(cases.simulation("p**2/2 + q**2/2"), [cases.recorded(times, np.cos(times))], 0.05)
+    outliers = next(m for m in p.searched if p.candidate(m).effect.name == "sensor_outliers")
+
+    def estimate(kind, evidence):
+        return Estimate((outliers,), kind, np.zeros(p.size), np.eye(p.size), np.array([0.5]), evidence, True,
+                        outliers=((0.1, 5.0),))  # fmt: skip
+
+    class Searching(Search):
+        """Finds these outliers beside an error of the clock, or, where they are left in, something else."""
+
+        def __init__(self, stepper, seeds, deadline, progress, spared):
+            found = Found(p, priors_without_effects(p))
+            base = () if spared else (outliers,)
+            self.weigher = SimpleNamespace(stepper=stepper, problem=p, found=found, base=base)
+            kinds = [estimate("white", 100.0 - ahead_of_white), estimate("clock", 100.0)]
+            found.estimates = {(): [estimate("white", without)]} if spared else {(outliers,): kinds}
+            found.prices = SimpleNamespace(log=lambda combination: 0.0)
+
+        def run(self):
+            return self.weigher.found
+
+    monkeypatch.setattr(_find, "Search", Searching)
+    found = _find._run(Stepper(p, 1), np.zeros((1, p.size)), 0.0, Options(progress=lambda said: None))
+    assert found.base == ((outliers,) if answer == "with" else ())

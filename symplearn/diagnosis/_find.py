@@ -21,6 +21,7 @@ from ._search import Search
 from ._start import first_fits, priors_without_effects
 from ._trajectory import Stepper
 from ._unnamed import proposals
+from ._weighed import Estimate
 
 # Third differences show the noise and some of the motion: the share of them that counts as noise at least.
 _ROUGH = 0.3
@@ -62,17 +63,28 @@ def searched(
 
 def _run(stepper: Stepper, seeds: np.ndarray, deadline: float, options: Options) -> Search:
     """Search with outliers taken out; anew with those of a column left in that turn out to be none: what the simulation
-    misses of a motion may look like outliers of a path that follows it, and takes their places in a combination."""
+    misses of a motion may look like outliers of a path that follows it, and takes their places in a combination. Beside
+    a clear remainder they may be a part of it: there the likelier one of both searches is the answer."""
     spared: frozenset[int] = frozenset()
+    rival: Search | None = None
     while True:
         search = Search(stepper, seeds, deadline, options.progress, spared)
         found = search.run()
+        if rival is not None and _most(rival.found) >= _most(found):
+            return rival
         best = speaker(found.estimates[max(found.estimates, key=found.odds)])
-        doubtful = doubtful_outliers(search.problem, search.base, best)
+        doubtful, rival = doubtful_outliers(search.problem, search.base, best), None
+        if not doubtful and _is_clear(found, best):
+            doubtful, rival = frozenset(search.problem.candidate(m).place for m in search.base), search
         if not doubtful or not found.complete:
             return search
         options.progress("leaving readings in that are no outliers")
         spared |= doubtful
+
+
+def _most(found: Found) -> float:
+    """What the probability of the likeliest answer goes with."""
+    return max(map(found.odds, found.estimates))
 
 
 def _with_unnamed(
@@ -106,6 +118,10 @@ def _is_open(odds: Posterior, found: Found) -> bool:
     if not odds.named or odds.unexplained >= odds.named[0].probability:
         return True
     best = odds.named[0].best
+    return len(best.combination) == MOST or _is_clear(found, best)
+
+
+def _is_clear(found: Found, best: Estimate) -> bool:
+    """Whether a clear remainder is left beside an answer."""
     white = found.of(best.combination, "white")
-    clear = white is None or best.log_evidence > white.log_evidence + _CLEAR
-    return len(best.combination) == MOST or clear
+    return white is None or best.log_evidence > white.log_evidence + _CLEAR
