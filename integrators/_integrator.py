@@ -7,7 +7,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from integrators._system import AbstractHamiltonian, AbstractSeparableHamiltonian, Forced, System, Time, split
+from integrators._system import (
+    AbstractHamiltonian,
+    AbstractSeparableHamiltonian,
+    Forced,
+    System,
+    Time,
+    conservative,
+    split,
+)
 
 
 class AbstractIntegrator(eqx.Module):
@@ -82,12 +90,23 @@ class AbstractIntegrator(eqx.Module):
     def march(
         self, system: System, state: Float[Array, "n ..."], t: Time, dt: Time, steps: int
     ) -> Float[Array, "n ..."]:
-        """The state `steps` steps of `dt` later, to round-off; a method that can share work between them does."""
+        """The state `steps` steps of `dt` later, to round-off, with what `joined` steps share done once."""
+        hamiltonian = conservative(system)
+        if hamiltonian is not None and hamiltonian.stands_still:
+            shared = self.joined(hamiltonian, state, dt, steps)
+            if shared is not None:
+                return shared
 
         def one(state: Float[Array, "n ..."], count: Array) -> tuple[Float[Array, "n ..."], None]:
             return self.step(system, state, t + count * dt, dt), None
 
         return jax.lax.scan(one, state, jnp.arange(steps))[0]
+
+    def joined(
+        self, hamiltonian: AbstractHamiltonian, state: Float[Array, "n ..."], dt: Time, steps: int
+    ) -> Float[Array, "n ..."] | None:
+        """`march` for a Hamiltonian that does not change with time, where steps share work; None where they do not."""
+        return None
 
     def accepts(self, system: System) -> None:
         """Raises `TypeError`, in the field's words, where this method cannot step `system`."""

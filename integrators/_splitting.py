@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from integrators._integrator import AbstractIntegrator
-from integrators._system import AbstractHamiltonian, System, Time, as_parameter, conservative, split
+from integrators._system import AbstractHamiltonian, Time, as_parameter, split
 
 # (q, p, x, y): the coordinates and momenta of both copies.
 _Copies = tuple[Array, Array, Array, Array]
@@ -56,12 +56,9 @@ class Leapfrog(AbstractVerlet):
         p = p - 0.5 * dt * hamiltonian.at(t + 0.75 * dt).slope(q, p)
         return jnp.concatenate([q, p])
 
-    def march(
-        self, system: System, state: Float[Array, "n ..."], t: Time, dt: Time, steps: int
-    ) -> Float[Array, "n ..."]:
-        hamiltonian = conservative(system)
-        if hamiltonian is None or not hamiltonian.stands_still:
-            return super().march(system, state, t, dt, steps)
+    def joined(
+        self, hamiltonian: AbstractHamiltonian, state: Float[Array, "n ..."], dt: Time, steps: int
+    ) -> Float[Array, "n ..."] | None:
         q, p = split(state)
         begun = q, p - 0.5 * dt * hamiltonian.slope(q, p)
 
@@ -176,12 +173,9 @@ class Tao(AbstractIntegrator):
         dx, dp = _push(late, q, y, 0.5 * dt)
         return jnp.concatenate([q, p + dp, x + dx, y])
 
-    def march(
-        self, system: System, state: Float[Array, "n ..."], t: Time, dt: Time, steps: int
-    ) -> Float[Array, "n ..."]:
-        hamiltonian = conservative(system)
-        if hamiltonian is None or not hamiltonian.stands_still:
-            return super().march(system, state, t, dt, steps)
+    def joined(
+        self, hamiltonian: AbstractHamiltonian, state: Float[Array, "n ..."], dt: Time, steps: int
+    ) -> Float[Array, "n ..."] | None:
         q, p, x, y = jnp.split(state, 4)
         dx, dp = _push(hamiltonian, q, y, 0.5 * dt)
 

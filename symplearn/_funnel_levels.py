@@ -17,6 +17,7 @@ from ._log_posterior import gradient
 from ._noise import AdditiveGaussian
 from ._parameters import flatten, resolve
 from ._posterior import LogPosterior
+from ._sampler import TOGETHER
 from ._student_mixture import shrunk
 
 # How far apart the levels of log Sigma are, how many there may be on each side, and nats below the highest at the last.
@@ -32,8 +33,6 @@ _LENGTHS = 8
 # Draws a level is weighed by, in how many rounds at most, how much wider than it, the least effective number, and the
 # share of effective ones from which on another round changes little.
 _DRAWS, _ROUNDS, _WIDER, _LEAST, _FITS = 512, 3, 1.1, 5.0, 1 / 3
-# Places that are looked at together.
-_CHUNK = 64
 
 
 class Level(NamedTuple):
@@ -151,8 +150,8 @@ class Walk:
 
     def _values(self, places: np.ndarray) -> np.ndarray:
         """The log posterior at some places, -inf where it is not a number; in chunks of one size, compiled once."""
-        size = -(-len(places) // _CHUNK) * _CHUNK
-        chunks = np.resize(places, (size, places.shape[1])).reshape(-1, _CHUNK, places.shape[1])
+        size = -(-len(places) // TOGETHER) * TOGETHER
+        chunks = np.resize(places, (size, places.shape[1])).reshape(-1, TOGETHER, places.shape[1])
         found = np.concatenate([_values(self.density, self.axes, jnp.asarray(one)) for one in chunks])[: len(places)]
         return np.where(np.isfinite(found), found, -np.inf)
 

@@ -21,7 +21,7 @@ LogDensity = Callable[[Any], Any]
 # no mean feels them.
 NEGLIGIBLE = 1e-3
 # Places whose log densities a processor computes together: with 128 of Henon-Heiles each took 1.5 times as long.
-_TOGETHER = 64
+TOGETHER = 64
 
 
 class Drawn(eqx.Module):
@@ -100,7 +100,7 @@ def whitened(density: LogDensity, start: Whitening, slopes: bool = False) -> Log
 def at_each(density: LogDensity, places: Float[Array, "place parameter"]) -> Float[Array, " place"]:
     """The log density at each place: on a processor so many at a time as stay in its cache."""
     count = len(places)
-    together = min(count, _TOGETHER) if jax.default_backend() == "cpu" else count
+    together = min(count, TOGETHER) if jax.default_backend() == "cpu" else count
     filled = jnp.concatenate([places, jnp.tile(places[-1:], (-count % together, 1))])
     parts = filled.reshape(-1, together, places.shape[1])
     return jax.lax.map(jax.vmap(density), parts).reshape(-1)[:count]

@@ -58,7 +58,7 @@ def test_it_is_the_most_probable_of_what_is_allowed(values, seed, known):
         if p.candidate(m).effect.name != "constant_force":
             low[place] = 0.0
     expected = by_scipy(one, free, low, np.full(p.size, np.inf))
-    # SciPy's method stays inside the bounds and comes within 1e-7 of them.
+    # SciPy's method stays inside the bounds and comes within 1e-7 of them; entries of z are of order one.
     np.testing.assert_allclose(within_bounds(p, bounded(p), one).z[free], expected, atol=1e-5)
 
 

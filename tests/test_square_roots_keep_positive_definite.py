@@ -100,6 +100,7 @@ def test_dependent_rows_get_a_zero_column():
     """A row that repeats another adds no pivot, and the derivative is that of the pivots there are."""
     M = jnp.array([[1.0, 2.0, 0.0], [2.0, 4.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 1.0]])
     L, good = triangularise(M)
+    # Entries of up to 20, products of a few terms: round-off of some 1e-15.
     np.testing.assert_allclose(L @ L.T, M @ M.T, atol=1e-14)
     assert good.tolist() == [True, False, False, True] and not np.any(L[:, 1:3])
     slope = jax.jacrev(lambda M: triangularise(M)[0])(M)
