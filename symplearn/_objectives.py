@@ -49,8 +49,9 @@ def as_time_series(recording: Any) -> TimeSeries:
     **Raises:** `InputError` where shapes disagree, times do not increase or there are fewer than two rows.
     """
     times, readings, inputs = recording.times, recording.readings, getattr(recording, "inputs", None)
-    if isinstance(times, jax.core.Tracer):
-        return TimeSeries(times, readings, inputs)
+    if any(isinstance(one, jax.core.Tracer) for one in (times, readings, inputs)):  # nothing to check yet
+        known = inputs is None or hasattr(inputs, "shape")
+        return TimeSeries(times, readings, inputs if known else _input_rows(inputs, np.asarray(times)))
     times, readings = np.asarray(times, dtype=float), np.asarray(readings, dtype=float)
     if times.ndim != 1 or readings.ndim != 2 or len(times) != len(readings) or len(times) < 2:
         raise InputError(
@@ -84,7 +85,8 @@ def as_recordings(recording: Any) -> tuple[TimeSeries, ...]:
 
     **Raises:** `InputError` as `as_time_series`, and for an empty list.
     """
-    several = recording if isinstance(recording, list | tuple) else (recording,)
+    is_one = hasattr(recording, "times")  # a named tuple may be one, too
+    several = recording if isinstance(recording, list | tuple) and not is_one else (recording,)
     if not several:
         raise InputError("No recording was given; give one, or a list of at least one.")
     return tuple(as_time_series(one) for one in several)
