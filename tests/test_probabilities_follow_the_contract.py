@@ -252,6 +252,20 @@ def test_how_wide_is_measured_in_each_effects_own_prior(problem):
     assert len(posterior(problem, fits, 1.0).named) == 1
 
 
+@pytest.mark.parametrize("effect", ["periodic_forcing", "hidden_oscillator"])
+def test_what_has_not_come_round_once_was_not_seen_to_swing(problem, effect):
+    """At the lowest frequency that is looked for, or below where a step led, an oscillation is not weighed, alone or in
+    a pair; above it is."""
+    one, other = place(problem, effect, "q1"), place(problem, "viscous_damping", "q2")
+    for combination in ((one,), tuple(sorted((one, other)))):
+        entry = dict(problem.placed(combination))[one].stop - 1
+        for omega, is_weighed in ((-1.0, False), (-1.1, False), (-0.9, True)):  # from -1 on
+            fit = estimate(problem, combination, 9.0)
+            fit.z[entry] = omega
+            named = posterior(problem, found(problem, estimate(problem, (), 0.0), fit), 1.0).named
+            assert [w.combination for w in named] == ([combination] if is_weighed else [])
+
+
 def test_a_remainder_that_is_not_white_tempers_every_evidence(problem):
     """At an inflation of 4 the log odds of evidence are a quarter, at 1 they stand; below 1 there is nothing to add."""
     one = (place(problem, "coulomb_friction", "q2"),)

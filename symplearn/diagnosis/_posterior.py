@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .._effects import HIDDEN, Oscillating
 from ._found import Found, speaker
 from ._problem import Combination, Problem
 from ._strength import faint_share
@@ -118,7 +119,8 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
     """Whether the recording says anything about every coefficient of a combination.
 
     An effect that calibration owns already (a stiffness beside a free stiffness) changes nothing, and its
-    posterior is its prior; weighing it would only dilute the others.
+    posterior is its prior; weighing it would only dilute the others. One that would swing, but fits best where it has
+    not come round once, at the lowest frequency looked for or below, was not seen to swing: any slow change would do.
     """
     best = max(found.estimates[combination], key=lambda e: e.log_evidence)
     sd = np.sqrt(np.diag(best.covariance))
@@ -128,4 +130,6 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
         amplitudes = slice(place.start, place.start + one.effect.amplitudes)
         scales = found.priors.scales[one.first : one.first + one.effect.amplitudes]
         known &= bool((sd[amplitudes] < _UNINFORMED * scales).all())
+        if one.effect is HIDDEN or isinstance(one.effect, Oscillating):
+            known &= bool(best.z[place.stop - 1] > found.priors.lower[one.values.stop - 1])
     return bool(np.isfinite(best.log_evidence) and known)
