@@ -4,8 +4,10 @@ import engine_cases as cases
 import numpy as np
 import pytest
 
+from symplearn.diagnosis._calibrate import grow
 from symplearn.diagnosis._found import Found
 from symplearn.diagnosis._null_paths import null_paths
+from symplearn.diagnosis._score import Start
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
 from symplearn.diagnosis._weigher import Weigher
@@ -30,13 +32,40 @@ y = {NOISE}
 @pytest.mark.parametrize("far", [FAR, []], ids=["outliers", "healthy"])
 def test_what_lies_far_off_is_left_out_and_nothing_else(far):
     """With a noise that is given, twenty of its sd off: those four of eighty readings; without them, none."""
-    readings = np.cos(TIMES) + NOISE * np.random.default_rng(0).normal(size=len(TIMES))
+    weigher, some = followed(1.0, far)
+    assert some is bool(far)
+    assert np.nonzero(weigher.flagged[0][:, 0])[0].tolist() == far
+    assert len(weigher.base) == bool(far)
+
+
+def followed(omega, far):
+    """A swing of frequency `omega`, followed by the simulation's of frequency one with a missing force, and whether
+    outliers were taken out."""
+    readings = np.cos(omega * TIMES) + NOISE * np.random.default_rng(0).normal(size=len(TIMES))
     readings[far] += 20 * NOISE * np.array([1, -1, -1, 1])[: len(far)]
     file = cases.simulation("p**2/2 + k*q**2/2", more=FILE)
     stepper = Stepper(cases.problem(file, [cases.recorded(TIMES, readings)], 0.25))
     priors = priors_without_effects(stepper.problem)
     weigher = Weigher(stepper, Found(stepper.problem, priors))
     paths = null_paths(stepper, priors.mean, weigher.rows, priors, 16)
-    assert weigher.take_out_outliers(paths, priors) is bool(far)
-    assert np.nonzero(weigher.flagged[0][:, 0])[0].tolist() == far
-    assert len(weigher.base) == bool(far)
+    return weigher, weigher.take_out_outliers(paths, priors)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("steps_short", [False, True], ids=["converged", "on its way"])
+def test_a_fit_that_is_far_off_is_granted_nothing_for_them(steps_short, monkeypatch):
+    """Where the simulation cannot follow, under no remainder is the evidence above what readings of that noise can
+    have: the density of all of them without any error."""
+    weigher, some = followed(1.05, FAR)
+    if steps_short:
+        monkeypatch.setattr("symplearn.diagnosis._weigher.grow", one_step)
+    weigher.weigh([Start(weigher.base, weigher.found.priors.mean, 0.0)], whole=True)
+    estimates = weigher.found.estimates[weigher.base]
+    highest = -sum(weigher.rows) * np.log(np.sqrt(2 * np.pi) * NOISE)
+    assert some and {"white", "coloured"} <= {e.kind for e in estimates}
+    assert estimates[0].converged is not steps_short
+    assert all(e.log_evidence < highest for e in estimates)
+
+
+def one_step(*arguments, **options):
+    return grow(*arguments, **{**options, "final": 1})

@@ -219,3 +219,11 @@ def test_outliers_that_are_not_there_have_no_evidence(problem):
     none = np.zeros((100, 2), bool)
     assert outlier_evidence((member(problem, "sensor_outliers"),), problem, e, none) == -np.inf
     assert outlier_evidence((), problem, e, none) == 0.0
+
+
+def test_a_column_with_outliers_has_no_other_heavy_tail(problem):
+    """What lies far off is excused once: beside outliers of a column its law gains nothing, the other column's does."""
+    both = np.random.default_rng(9).standard_t(3, size=(100, 2))
+    for column in range(2):
+        found = law_gain(problem, (member(problem, "sensor_outliers", column),), both)
+        assert found == law_gain(problem, (), alone(both[:, 1 - column], 1 - column)) > 1

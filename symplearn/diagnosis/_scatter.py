@@ -36,12 +36,14 @@ def law_gain(problem: Problem, combination: Combination, errors: Float[np.ndarra
 
     `errors` are innovations by their own standard deviations, NaN where there is none: under a remainder, too, what is
     predicted of a reading has the two moments it has, and either law's tails. A heavy tail is the sensor's own, no
-    mismatch.
+    mismatch. A column with outliers has a law of its own (`outlier_evidence`): what lies far off is excused once.
     """
     known, total = problem.noise_of(combination), 0.0
+    ones = [problem.candidate(m) for m in combination]
+    own = {one.place for one in ones if one.effect is OUTLIERS}
     for j in range(errors.shape[1]):
         e = errors[~np.isnan(errors[:, j]), j]
-        if len(e) and np.mean(e**2) < _ASTRAY:
+        if j not in own and len(e) and np.mean(e**2) < _ASTRAY:
             total += float(tail_gain(e, bool(np.isnan(known[j]))))
     return total
 

@@ -42,7 +42,10 @@ class Weigher:
         self.found = found
         self.rows = [r.fitted for r in stepper.problem.rows]
         self.base: Combination = ()
-        self.owed: dict[Combination, float] = {}  # log evidence of the readings that were taken out
+        # Log evidence of the readings that were taken out: by the errors of each white fit, and by those of the path
+        # that they were found to lie off.
+        self.owed: dict[Combination, float] = {}
+        self.owed_along = 0.0
         self.flagged = [np.zeros_like(r.readings, bool) for r in stepper.problem.rows]
 
     @property
@@ -81,6 +84,7 @@ class Weigher:
         some = np.any([bad.any(0) for bad in self.flagged], axis=0)
         self.stepper = self.plain.on(problem.without(self.flagged)) if some.any() else self.plain
         self.base = tuple(sorted(m for j, m in columns.items() if some[j]))[: MOST - 1]
+        self.owed_along = self._path_owed(best, self.base) if self.base else 0.0
         return bool(some.any())
 
     def _far(self, fit: PathFit, may: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -90,12 +94,18 @@ class Weigher:
     def _with_outliers(self, fit: PathFit) -> float:
         """Log evidence of a path and of what was left out of it."""
         assert fit.left_out is not None  # this is asked after a fit without them
-        errors = np.concatenate([self._path_errors(fit, r) for r in range(len(self.rows))])
         flagged = np.concatenate(fit.left_out)
         members = tuple(m for m in self.plain.problem.searched if self.plain.problem.candidate(m).effect is OUTLIERS
                         and flagged[:, self.plain.problem.candidate(m).place].any())  # fmt: skip
-        owed = outlier_evidence(members, self.plain.problem, errors, flagged)
-        return fit.log_evidence + owed - float((flagged.sum(0) * np.log(fit.noise)).sum())
+        return fit.log_evidence + self._path_owed(fit, members)
+
+    def _path_owed(self, fit: PathFit, members: Combination) -> float:
+        """Log evidence of what was left out of a path, in the readings' own unit."""
+        assert fit.left_out is not None
+        errors, flagged = np.concatenate([self._path_errors(fit, r) for r in range(len(self.rows))]), fit.left_out
+        number = np.concatenate(flagged).sum(0)
+        owed = outlier_evidence(members, self.plain.problem, errors, np.concatenate(flagged))
+        return owed - float((number * np.log(fit.noise)).sum())
 
     def _path_errors(self, fit: PathFit, r: int) -> np.ndarray:
         """Readings less those on a path, by their noise; NaN where nothing was read."""
@@ -135,8 +145,7 @@ class Weigher:
             self._add(estimate, *self._outliers(fits, b))
         correlated = weigh_coloured(self.problem, fits, priors, self.rows)
         for estimate in correlated + weigh_positional(self.problem, fits, priors, self.rows):
-            white = self.found.of(estimate.combination, "white")
-            self._add(estimate, self.owed[estimate.combination], white.outliers if white else ())
+            self._add_beside_white(estimate)
 
     def weigh_clocks(self, combinations: Sequence[Combination]) -> None:
         """Weigh combinations, fitted before, where the clock may run ahead and behind beside a coloured error."""
@@ -150,8 +159,7 @@ class Weigher:
         fits = Fits(own, z, noise, predictions, np.zeros(len(z)), converged)
         colours = [one.colours for c in own if (one := self.found.of(c, "coloured"))]
         for one in weigh_clock(self.problem, fits, self.found.priors, self.rows, colours):
-            white = self.found.of(one.combination, "white")
-            self._add(one, self.owed[one.combination], white.outliers if white else ())
+            self._add_beside_white(one)
 
     def _whites(self, fits: Fits, rows: list[int]) -> np.ndarray:
         """Log evidences under white noise, by lane, with what unfinished fits promise."""
@@ -160,7 +168,20 @@ class Weigher:
 
     def _add(self, estimate: Estimate, value: float, told: tuple[tuple[float, float], ...]) -> None:
         self.owed[estimate.combination] = value
-        self.found.add(replace(estimate, log_evidence=estimate.log_evidence + value, outliers=told))
+        owed = value if estimate.converged else self._owed_beside(estimate.combination)
+        self.found.add(replace(estimate, log_evidence=estimate.log_evidence + owed, outliers=told))
+
+    def _add_beside_white(self, estimate: Estimate) -> None:
+        """Add an estimate under another remainder than white noise."""
+        white = self.found.of(estimate.combination, "white")
+        owed, told = self._owed_beside(estimate.combination), white.outliers if white else ()
+        self.found.add(replace(estimate, log_evidence=estimate.log_evidence + owed, outliers=told))
+
+    def _owed_beside(self, combination: Combination) -> float:
+        """What the readings that were taken out owe where errors are not those of the white fit: beside a remainder,
+        or where the fit is still on its way. A fit far off would be granted what its own evidence does not lose."""
+        own = self.owed.get(combination, 0.0)
+        return min(own, self.owed_along) if self.base else own
 
     def _is_placed(self, start: Start) -> bool:
         """Whether the effect that a score added has a place."""
@@ -221,7 +242,7 @@ class Weigher:
                     best.z,
                     best.laplace.covariance,
                     best.noise,
-                    float(mean) + self.owed.get(combination, 0.0),
+                    float(mean) + self._owed_beside(combination),
                     best.converged,
                     intensity=best.intensity,
                     paths=best.paths,
