@@ -76,7 +76,7 @@ def strength(rows: Sequence[Row], threshold: float) -> Figure:
     concealed = [r for r in rows if r["way"] != "healthy"]
     for mark, colour, shape, label in ((True, BLUE, "o", "named exactly"), (False, RED, "+", "not named")):
         some = [r for r in concealed if r["exact"] is mark]
-        x = [min(max(r["detectable"], 0.3), 1e3) for r in some]
+        x = [max(r["detectable"], 0.3) for r in some]
         axes.plot(x, [r["score"] for r in some], shape, color=colour, fillstyle="none", markersize=6, label=label)
     healthy = [r["score"] for r in rows if r["way"] == "healthy"]
     axes.plot(np.full(len(healthy), 0.2), healthy, "x", color=GREY, markersize=4, label="nothing hidden")
