@@ -23,9 +23,6 @@ from ._transforms import STANDARD, AbstractTransform, Moments, Taylor
 
 # Bytes of the states of all readings beyond which a gradient does not keep all of them, but takes a third longer.
 _KEPT = 2_000_000
-# Numbers in the dynamics up to which the first reading is in the loop, by a branch; the derivative of a branch copies
-# all that a network went through, and its gradient took 1.4 times as long.
-_BRANCHED = 1_000
 
 
 class Filtered(eqx.Module):
@@ -81,21 +78,14 @@ class Sequential(AbstractPassage):
             # The first reading goes through the loop as well: with it outside, kernel by kernel, the likelihood of 20
             # readings of 20 substeps took half as long again.
             first = functools.partial(_as_it_is, carry, jax.eval_shape(later))
-            predicted = jax.lax.cond(k == 0, first, later) if is_first_inside else later()
+            predicted = jax.lax.cond(k == 0, first, later)
             carry, record = measure(inside, transform, carry, predicted, reading, context, k)
             return carry, (record if keep else None)
 
         # Checkpointing the step makes the gradient faster as well as 16 times smaller (performance.md, A7).
         step = jax.checkpoint(step, prevent_cse=False)
         carry, records = unscored(jnp.asarray(model.initial.mean), model.initial.root), None
-        kept = len(readings) * sum(leaf.nbytes for leaf in carry) <= _KEPT
-        size = sum(np.size(leaf) for leaf in jax.tree.leaves(model.dynamics))
-        is_first_inside = size <= _BRANCHED or keep or not kept
-        if not is_first_inside:
-            carry, _ = begin(model, transform, readings[0], slice_at(contexts, 0))
-            later_on = jax.tree.map(lambda leaf: leaf[1:], (readings, contexts))
-            carry, _ = jax.lax.scan(step, carry, (later_on[0], intervals, later_on[1], np.arange(1, len(readings))))
-        elif keep or kept:
+        if keep or len(readings) * sum(leaf.nbytes for leaf in carry) <= _KEPT:
             # The first interval stands for the one before the first reading, of which nothing is used.
             before = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:1], leaf]), intervals)
             carry, records = jax.lax.scan(step, carry, (readings, before, contexts, np.arange(len(readings))))
