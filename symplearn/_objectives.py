@@ -49,10 +49,10 @@ def as_time_series(recording: Any) -> TimeSeries:
     **Raises:** `InputError` where shapes disagree, times do not increase or there are fewer than two rows.
     """
     times, readings, inputs = recording.times, recording.readings, getattr(recording, "inputs", None)
-    if any(isinstance(one, jax.core.Tracer) for one in (times, readings, inputs)):  # nothing to check yet
-        known = inputs is None or hasattr(inputs, "shape")
-        return TimeSeries(times, readings, inputs if known else _input_rows(inputs, np.asarray(times)))
-    times, readings = np.asarray(times, dtype=float), np.asarray(readings, dtype=float)
+    if isinstance(times, jax.core.Tracer):
+        return TimeSeries(times, readings, inputs)
+    times, is_known = np.asarray(times, dtype=float), not isinstance(readings, jax.core.Tracer)
+    readings = np.asarray(readings, dtype=float) if is_known else readings
     if times.ndim != 1 or readings.ndim != 2 or len(times) != len(readings) or len(times) < 2:
         raise InputError(
             f"A recording needs times (n,) and readings (n, channels) with n of at least 2, but has shapes "
@@ -60,15 +60,15 @@ def as_time_series(recording: Any) -> TimeSeries:
         )
     if not np.all(np.isfinite(times)) or not np.all(np.diff(times) > 0):
         raise InputError("The times of a recording must be finite and strictly increasing; sort or clean them first.")
-    if np.any(np.isinf(readings)):
+    if is_known and np.any(np.isinf(readings)):
         raise InputError("A recording has infinite readings; give NaN where a reading is missing.")
     return TimeSeries(jnp.asarray(times), jnp.asarray(readings), _input_rows(inputs, times))
 
 
 def _input_rows(inputs: Any, times: np.ndarray) -> Array | None:
     """The inputs at the rows: given as an array, or as the `Inputs` of a recording that was read from a file."""
-    if inputs is None:
-        return None
+    if inputs is None or isinstance(inputs, jax.core.Tracer):
+        return inputs
     rows = np.asarray(
         inputs.at(times) if hasattr(inputs, "at") and not hasattr(inputs, "shape") else inputs, dtype=float
     )

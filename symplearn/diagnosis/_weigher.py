@@ -100,12 +100,15 @@ class Weigher:
         return fit.log_evidence + self._path_owed(fit, members)
 
     def _path_owed(self, fit: PathFit, members: Combination) -> float:
-        """Log evidence of what was left out of a path, in the readings' own unit."""
+        """Log evidence of what was left out of a path."""
         assert fit.left_out is not None
-        errors, flagged = np.concatenate([self._path_errors(fit, r) for r in range(len(self.rows))]), fit.left_out
-        number = np.concatenate(flagged).sum(0)
-        owed = outlier_evidence(members, self.plain.problem, errors, np.concatenate(flagged))
-        return owed - float((number * np.log(fit.noise)).sum())
+        errors = np.concatenate([self._path_errors(fit, r) for r in range(len(self.rows))])
+        return self._owed(members, errors, np.concatenate(fit.left_out), fit.noise)
+
+    def _owed(self, members: Combination, errors: np.ndarray, flagged: np.ndarray, noise: np.ndarray) -> float:
+        """Log evidence of the readings that were taken out, as a density in their own unit."""
+        value = outlier_evidence(members, self.plain.problem, errors, flagged)
+        return value - float((flagged.sum(0) * np.log(noise)).sum())
 
     def _path_errors(self, fit: PathFit, r: int) -> np.ndarray:
         """Readings less those on a path, by their noise; NaN where nothing was read."""
@@ -203,9 +206,7 @@ class Weigher:
         errors = standardised([x[lane] for x in r], weight, fits.noise[lane])
         flagged = np.concatenate([bad[:n] for bad, n in zip(self.flagged, self.rows, strict=True)])
         told = [outliers(errors[:, j], flagged[:, j]) for j in range(self.problem.channels)]
-        value = outlier_evidence(self.base, self.problem, errors, flagged)
-        number = flagged.sum(0)
-        value -= float((number * np.log(fits.noise[lane])).sum())  # densities in the readings' own unit
+        value = self._owed(self.base, errors, flagged, fits.noise[lane])
         return value, tuple((share, size * float(s)) for (share, size), s in zip(told, fits.noise[lane], strict=True))
 
     def weigh_with_outliers_in(self) -> None:
