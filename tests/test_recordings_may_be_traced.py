@@ -39,8 +39,8 @@ def test_only_the_readings(recorded):
     slope = np.asarray(jax.jit(jax.grad(score))(jnp.asarray(readings)))
     step = 1e-5 * np.eye(readings.size).reshape(-1, *readings.shape)
     many = jax.jit(jax.vmap(score))
-    # The score is quadratic in a linear model's readings, so central differences are exact but for round-off. Measured:
-    # score 21, slopes up to 18, difference 6e-10 (1e-15 of the score over a step of 1e-5); thirty times that is allowed.
+    # The score is quadratic in a linear model's readings, so central differences are exact but for round-off. Seen:
+    # score 21, slopes up to 18, difference 6e-10 (1e-15 of the score over a step of 1e-5); 30 times that is allowed.
     expected = np.asarray(many(readings + step) - many(readings - step)).reshape(readings.shape) / 2e-5
     np.testing.assert_allclose(slope, expected, atol=1e-9 * np.abs(expected).max())
     with pytest.raises(sl.InputError, match="infinite"):
