@@ -81,6 +81,10 @@ class PowerForce(Effect):
     power: int = 0
     sign: int = -1
 
+    @property
+    def acts_on(self) -> str:
+        return COORDINATE
+
     def potential(self, q: sympy.Expr) -> sympy.Expr:
         """Potential energy per unit coefficient, so that the force is minus its slope."""
         return sympy.Rational(-self.sign, self.power + 1) * q ** (self.power + 1)
@@ -167,6 +171,8 @@ DELAY = Effect("sensor_delay", positive=True)
 NOISE = Effect("sensor_noise", amplitudes=0)
 OUTLIERS = Effect("sensor_outliers", amplitudes=0)
 
+# Beside the powers these shape a force of place that has no word; they are never reported.
+SHAPES = (PowerForce("quartic_stiffness", power=4), PowerForce("quintic_stiffness", power=5))
 UNNAMED = Effect("unnamed_force")  # its amplitudes are as many as its expression has terms
 
 ON_COORDINATES = (*POWERS, VISCOUS, QUADRATIC, COULOMB, EXCITATION, STOP, FORCING, IMPULSE, HIDDEN)
@@ -236,6 +242,7 @@ def vocabulary(
         listed += [Candidate(effect, (name,), (k,)) for name, k in (parameters or {}).items()]
     for effect in ON_COLUMNS:
         listed += [Candidate(effect, (c,), (j,)) for j, c in enumerate(columns)]
+    listed += [Candidate(effect, (q,), (i,)) for effect in SHAPES for i, q in enumerate(coordinates)]
     for i, terms in (unnamed or {}).items():
         effect = replace(UNNAMED, amplitudes=len(terms))
         listed.append(Candidate(effect, (coordinates[i],), (i,), terms=terms))

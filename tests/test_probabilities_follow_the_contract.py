@@ -37,6 +37,8 @@ DAMPING, GAIN = 1 / (FAMILIES * 4 * 2), 1 / (FAMILIES * 5 * 2)  # of a drag on a
 ONE_TARGET = {"relative_damping", "coupling_spring", "central_correction", "gyroscopic_coupling",
               "parametric_modulation", "parameter_drift", "regime_change", "parameter_error"}  # fmt: skip
 
+KINDS = ("white", "coloured", "clock", "positional", "static", "force")
+
 
 @pytest.fixture(scope="module")
 def problem():
@@ -61,6 +63,11 @@ def estimate(problem, combination, log_evidence, kind="white", sd=0.01):
     return Estimate(combination, kind, nothing, covariance, noise, log_evidence, True)
 
 
+def alike(problem, combination, log_evidence, sd=0.01):
+    """The same under white noise and beside every kind of remainder."""
+    return [estimate(problem, combination, log_evidence, kind, sd) for kind in KINDS]
+
+
 def found(problem, *estimates):
     zero, ones = np.zeros(problem.size), np.ones(problem.equations.size)
     out = Found(problem, Priors(zero, zero, 0 * ones, ones, -ones, ones, np.ones(2)))
@@ -80,12 +87,13 @@ def price(problem, candidate):
 
 
 def test_every_effect_on_every_target_is_in_the_vocabulary(problem):
-    """Two coordinates, their pair, a parameter and two columns, each once with each effect; a stop once by side."""
+    """Two coordinates, their pair, a parameter and two columns, each once with each effect; a stop once by side. Beside
+    it two powers of each coordinate that shape a force without a name, and are never looked for."""
     keys = [(c.effect.name, c.target if isinstance(c.target, str) else tuple(c.target), c.side)
             for c in problem.equations.candidates]  # fmt: skip
     assert len(set(keys)) == len(keys)
     by_hand = {effect for family in EFFECTS.values() for effect in family} | {"sensor_noise"}
-    assert {effect for effect, _, _ in keys} == by_hand
+    assert {effect for effect, _, _ in keys} == by_hand | {"quartic_stiffness", "quintic_stiffness"}
     for effect in by_hand:
         targets = {target for name, target, _ in keys if name == effect}
         if effect in ("relative_damping", "coupling_spring", "central_correction", "gyroscopic_coupling"):
@@ -125,8 +133,8 @@ def test_members_in_some_recordings_share_what_their_target_has(recordings):
         once = problem.candidate(m).effect.name == "impulse" and recordings > 1
         variants = [v for v in problem.variants(m) if not once or len(problem.members[v].recordings) == 1]
         members += variants if once else [m, *variants]
-    fits = [estimate(problem, (), 1.0, kind) for kind in ("white", "coloured", "clock", "positional", "force")]
-    p = posterior(problem, found(problem, *fits, *(estimate(problem, (m,), 1.0) for m in members)), 1.0)
+    fits = [one for c in [(), *((m,) for m in members)] for one in alike(problem, c, 1.0)]
+    p = posterior(problem, found(problem, *fits), 1.0)
     assert p.as_it_is == pytest.approx(0.5, rel=1e-9) and p.unexplained == pytest.approx(0.5 / FAMILIES, rel=1e-9)
     whole, part = {}, {}
     for w in p.named:
@@ -171,8 +179,7 @@ def test_a_narrower_search_shares_among_what_is_left():
 @pytest.mark.parametrize("value", [0.0, -1234.5, 5678.9])
 def test_equal_evidences_give_the_prior_back(problem, value):
     """Where all explain alike: 1/2 for nothing, 1/8 for the unexplained, half its price for each effect."""
-    fits = [estimate(problem, (), value, kind) for kind in ("white", "coloured", "clock", "positional", "force")]
-    fits += [estimate(problem, c, value) for c in singles(problem)]
+    fits = [one for c in [(), *singles(problem)] for one in alike(problem, c, value)]
     p = posterior(problem, found(problem, *fits), 1.0)
     # Evidences of some thousands keep twelve digits behind the point.
     assert p.as_it_is == pytest.approx(0.5, rel=1e-9)
@@ -185,11 +192,7 @@ def test_probabilities_add_to_one_and_come_likeliest_first(problem):
     """With arbitrary evidences of all singles and pairs under every kind of remainder."""
     rng = np.random.default_rng(0)
     everything = [(), *singles(problem), *combinations(problem.searched, 2)]
-    fits = [
-        estimate(problem, c, 4 * rng.normal(), kind)
-        for c in everything
-        for kind in ("white", "coloured", "clock", "positional", "force")
-    ]
+    fits = [estimate(problem, c, 4 * rng.normal(), kind) for c in everything for kind in KINDS]
     p = posterior(problem, found(problem, *fits), 1.0)
     named = [w.probability for w in p.named]
     assert p.as_it_is + p.unexplained + p.faint + sum(named) == pytest.approx(1.0, rel=ROUND_OFF)
@@ -211,19 +214,22 @@ def test_what_was_not_fitted_may_be_too_weak_to_be_seen(problem):
 def test_a_combination_pays_every_members_price(problem):
     """Odds of a pair against nothing are the product of two prices, times the ratio of evidences."""
     pair = (place(problem, "viscous_damping", "q1"), place(problem, "sensor_gain", "b"))
-    p = posterior(problem, found(problem, estimate(problem, (), -3.0), estimate(problem, pair, 2.0)), 1.0)
+    p = posterior(problem, found(problem, *alike(problem, (), -3.0), *alike(problem, pair, 2.0)), 1.0)
     odds = p.named[0].probability / p.as_it_is
     assert odds == pytest.approx(DAMPING * GAIN * np.exp(5.0), rel=1e-9)
 
 
-def test_a_remainder_beside_a_finding_costs_its_familys_share(problem):
-    """An effect with a remainder is weighed as the effect alone is, at the price of `any`, shared by its kinds."""
-    one = (place(problem, "viscous_damping", "q1"),)
-    values = (("white", 0.0), ("coloured", 3.0), ("clock", 1.5), ("positional", 2.0), ("force", 1.0))
-    kinds = [estimate(problem, one, value, kind) for kind, value in values]
-    p = posterior(problem, found(problem, estimate(problem, (), 0.0), *kinds), 1.0)
-    expected = DAMPING * (1 + 1 / FAMILIES * sum(map(np.exp, (3.0, 1.5, 2.0, 1.0))) / 4)
+def test_beside_a_finding_a_remainder_has_a_quarter(problem):
+    """Of an effect's price, three quarters go to white noise alone and one to the kinds of remainder, which share it. A
+    kind that gains more than the effect does has the price of `any` there, as all have without a finding."""
+    one, nothing = (place(problem, "viscous_damping", "q1"),), [estimate(problem, (), 0.0, kind) for kind in KINDS]
+    values = dict(zip(KINDS, (2.0, 5.0, 3.5, 3.0, -1.0, 3.0), strict=True))
+    shares = dict(zip(KINDS, (3 / 4, 1 / FAMILIES / 5, *[1 / 4 / 5] * 4), strict=True))
+    kinds = [estimate(problem, one, value, kind) for kind, value in values.items()]
+    p = posterior(problem, found(problem, *nothing, *kinds), 1.0)
+    expected = DAMPING * sum(shares[kind] * np.exp(value) for kind, value in values.items())
     assert p.named[0].probability / p.as_it_is == pytest.approx(expected, rel=1e-9)
+    assert p.unexplained / p.as_it_is == pytest.approx(1 / FAMILIES, rel=1e-9)
     assert p.named[0].best.kind == "coloured"
 
 
@@ -269,7 +275,7 @@ def test_what_has_not_come_round_once_was_not_seen_to_swing(problem, effect):
 def test_a_remainder_that_is_not_white_tempers_every_evidence(problem):
     """At an inflation of 4 the log odds of evidence are a quarter, at 1 they stand; below 1 there is nothing to add."""
     one = (place(problem, "coulomb_friction", "q2"),)
-    fits = found(problem, estimate(problem, (), -20.0), estimate(problem, one, 0.0))
+    fits = found(problem, *alike(problem, (), -20.0), *alike(problem, one, 0.0))
     for inflation, evidence in ((4.0, 5.0), (1.0, 20.0), (0.5, 20.0)):
         p = posterior(problem, fits, inflation)
         assert np.log(p.named[0].probability / p.as_it_is) == pytest.approx(np.log(DAMPING) + evidence, rel=1e-9)

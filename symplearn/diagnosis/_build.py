@@ -114,7 +114,9 @@ def build(
         initial=_initial(file, built),
         noise=np.array([file.recording.noise.get(c, np.nan) * noise_factor(file, c) for c in built.columns], float),
         searched=tuple(
-            i for i, c in enumerate(built.candidates) if not c.terms and restriction.allows(c) and _is_open(file, c)
+            i
+            for i, c in enumerate(built.candidates)
+            if c.effect.name in EFFECTS and restriction.allows(c) and _is_open(file, c)
         ),
         units=dict(file.units),
         known_outliers=tuple(

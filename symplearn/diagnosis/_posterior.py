@@ -1,6 +1,6 @@
 """From evidences to probabilities: the contract's prior, the price of a combination, tempering under misfit."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +15,10 @@ from ._weighed import Estimate
 _UNINFORMED = 0.7
 # The simulation counts as consistent unless the probability of nothing left out is below this (contract).
 CONSISTENT = 0.05
-# Kinds of remainder other than white noise; each combination divides its remainder's prior among them.
-_REMAINDERS = ("coloured", "clock", "positional", "force")
+# Prior share of a remainder beside findings, which is seen with about one of four.
+_BESIDE = 0.25
+# Kinds of remainder other than white noise, which divide its prior among them.
+_REMAINDERS = ("coloured", "clock", "positional", "static", "force")
 
 
 @dataclass(frozen=True)
@@ -56,23 +58,25 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     if not np.isfinite(top):
         return Posterior(0.0, 1.0, (), 0.0, speaker(found.estimates[()]), {(): -np.inf}, factor)
     unseen = min((one.score for one in found.ahead.values()), default=0.0)
+    bare = found.of((), "white")
+    least = -np.inf if bare is None else top + factor * (bare.log_evidence - top)
     white, other, named = -np.inf, -np.inf, []
     evidences: dict[Combination, float] = {}
     for combination, estimates in found.estimates.items():
         tempered = {e.kind: top + factor * (e.log_evidence - top) for e in estimates}
         plain = tempered.get("white", -np.inf)
-        noisy = _mixture([tempered.get(kind, -np.inf) for kind in _REMAINDERS])
+        noisy = _beside_a_remainder(tempered, least if combination else np.inf, remainder)
         ahead = found.ahead[combination].score if combination in found.ahead else unseen
         plain, noisy = plain + ahead, noisy + ahead
-        total = float(np.logaddexp(plain, np.log(remainder) + noisy))
-        evidences[combination] = total if combination else max(plain, noisy)
+        total = float(np.logaddexp(plain + np.log(1.0 - _BESIDE), noisy))
+        evidences[combination] = total if combination else max(plain, noisy - np.log(remainder))
         if not combination:
             white, other = plain, noisy
         elif any(e.converged for e in estimates) and _informed(problem, found, combination):
             named.append((combination, found.prices.log(combination), total, speaker(estimates)))
     with np.errstate(divide="ignore"):
         faint = white + np.log(_unseen(problem, found))
-    logs = np.array([white, np.log(remainder) + other, faint, *(w + total for _, w, total, _ in named)])
+    logs = np.array([white, other, faint, *(w + total for _, w, total, _ in named)])
     probability = np.exp(logs - logs.max())
     probability /= probability.sum()
     ranked = sorted(zip(named, probability[3:], strict=True), key=lambda pair: -pair[1])
@@ -85,6 +89,19 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
         evidences=evidences,
         tempered=factor,
     )
+
+
+def _beside_a_remainder(tempered: Mapping[str, float], least: float, price: float) -> float:
+    """Log evidence of a combination beside a remainder, prior of the remainder included; `least` is that of nothing.
+
+    Real systems often keep a small one. But one that gains more than the findings do is not small beside them: it has
+    the contract's price of what has no name, as it has without findings.
+    """
+    logs = []
+    for kind in _REMAINDERS:
+        value, white = tempered.get(kind, -np.inf), tempered.get("white", -np.inf)
+        logs.append(value + np.log(_BESIDE if white - least >= value - white else price))
+    return _mixture(logs)
 
 
 def _unseen(problem: Problem, found: Found) -> float:

@@ -36,8 +36,10 @@ _FORCED = 6
 _BATCH = 24
 # Of each size, combinations whose clock may wander, however far behind.
 _SIMPLE = 2
-# Combinations that are weighed again in finer steps.
+# Combinations that are weighed again in finer steps, or beside a force that goes with place.
 _AGAIN = 24
+# Of each size, combinations that are weighed beside a force that goes with place, however far behind.
+_STATIC = 8
 # Places at which an effect is tried beside others than the best of the size below.
 _FEW = 60
 _ONE_MORE = {1: "one effect", 2: "a second effect", 3: "a third effect"}
@@ -93,6 +95,7 @@ class Search:
                 break
         self._refine()
         self._weigh_clocks()
+        self._weigh_static()
         if self._in_time():
             self.refinement.weigh_beside_the_remainder()
         self.progress("weighing missing forces beside the best combinations")
@@ -182,6 +185,7 @@ class Search:
             self.refinement.move_places()
         w.add_paths(fit_paths(w.stepper, self.null_paths, w.found.priors, self.rows, 3))
         self._weigh_clocks()
+        self._weigh_static()
         self._weigh_forces()
         w.weigh_with_outliers_in()
         return self.found
@@ -352,6 +356,17 @@ class Search:
             # What a clock excuses may be all that a larger one has ahead of the best of its size.
             few = [c for size in range(1, MOST) for c in [c for c in ranked if self._size(c) == size][:_SIMPLE]]
             self.weigher.weigh_clocks(list(dict.fromkeys([*near, self.base, *few])))
+
+    def _weigh_static(self) -> None:
+        """The best combinations again beside a force that goes with place, which any of their forces may stand for; not
+        nothing: alone such a force is no remainder."""
+        ranked = sorted(self.found.estimates, key=self.found.odds, reverse=True)
+        if ranked[0] != self.base:
+            self.progress("weighing small forces that go with place")
+            top = self.found.odds(ranked[0])
+            near = [c for c in ranked if self.found.odds(c) > top - _REACH][:_AGAIN]
+            few = [c for size in range(1, MOST) for c in [c for c in ranked if self._size(c) == size][:_STATIC]]
+            self.weigher.weigh_static([c for c in dict.fromkeys([*near, self.base, *few]) if c])
 
     def _weigh_forces(self) -> None:
         """Best combinations again, each with a missing force beside it; only the very best where that needs none."""

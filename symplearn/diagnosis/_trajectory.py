@@ -212,7 +212,7 @@ class Stepper:
         `laid` are lanes of further effects as `_scan.layout` has them, at most `LANES`; `combination` moves at `z`.
         """
         p, local = self.problem, self.problem.local(r)
-        some, hots = self._beside(z, combination, laid, r)
+        some, hots = self._beside([(z, combination, one) for one in laid], r)
         along = []
         for _, matrix, amplitudes in laid:
             unseen = [p.equations.width - 1, 2 * p.equations.width - 1] if matrix[-1].any() else []
@@ -230,13 +230,22 @@ class Stepper:
     ) -> list[Float[np.ndarray, "direction time _"]]:
         """Slopes of one recording's readings and phase points, by lane: along the amplitudes of each of `laid`, as in
         `responses`, and along the start where there are none."""
-        some, hots = self._beside(z, combination, laid, r)
+        return [slopes for _, slopes in self.carried_each([(z, combination, one) for one in laid], rows, r)]
+
+    def carried_each(
+        self, lanes: Sequence[tuple[np.ndarray, Combination, Any]], rows: int, r: int
+    ) -> list[tuple[Float[np.ndarray, "time _"], Float[np.ndarray, "direction time _"]]]:
+        """The same of several motions: by lane its unknowns, its combination and one of `laid`; readings and phase
+        points, and their slopes."""
+        some, hots = self._beside(lanes, r)
         start = np.arange(self.problem.state)
-        along = [self._further + np.concatenate(amplitudes) if amplitudes else start for _, _, amplitudes in laid]
+        along = [self._further + np.concatenate(one[2]) if one[2] else start for _, _, one in lanes]
         found = []
         for a in range(0, len(along), LANES):
-            _, slopes = self._run(r, some[a : a + LANES], hots[a : a + LANES], along[a : a + LANES], rows)
-            found += [own[: len(places), :rows] for own, places in zip(slopes, along[a : a + LANES], strict=True)]
+            few = slice(a, a + LANES)
+            shown, slopes = self._run(r, some[few], hots[few], along[few], rows)
+            found += [(x[:rows], own[: len(places), :rows])
+                      for x, own, places in zip(shown, slopes, along[few], strict=True)]  # fmt: skip
         return found
 
     @property
@@ -244,14 +253,12 @@ class Stepper:
         """Where the values of further effects stand in what one recording depends on."""
         return self.problem.state + self.problem.calibrated.size
 
-    def _beside(
-        self, z: np.ndarray, combination: Combination, laid: Sequence[Any], r: int
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _beside(self, lanes: Sequence[tuple[np.ndarray, Combination, Any]], r: int) -> tuple[np.ndarray, np.ndarray]:
         """Unknowns and coefficients of lanes that move as a combination does and have further effects."""
         p = self.problem
-        fixed = p.coefficients(r, z, combination) - p.coefficients(r, z, ())
         some, hots = [], []
-        for values, matrix, _ in laid:
+        for z, combination, (values, matrix, _) in lanes:
+            fixed = p.coefficients(r, z, combination) - p.coefficients(r, z, ())
             own = z[p.local(r)].copy()
             own[self._further :] = values
             hot = matrix.copy()

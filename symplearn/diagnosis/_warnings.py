@@ -20,6 +20,7 @@ _REMAINDERS = {
     "coloured": "an error of the sensor",
     "clock": "an error of the clock",
     "positional": "an error of the sensor that goes with what it reads",
+    "static": "a small force that goes with place",
     "force": "a small missing force",
 }
 

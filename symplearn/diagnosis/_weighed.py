@@ -32,7 +32,8 @@ class Estimate:
     """A combination fitted under one kind of remainder.
 
     `kind` is `white` (no remainder), `coloured` (an error of the sensor with a memory), `clock` (one of its clock
-    beside that), `positional` (one that goes with what is read) or `force` (a white missing force of `intensity`).
+    beside that), `positional` (one that goes with what is read), `static` (a small force that goes with a
+    coordinate) or `force` (a white missing force of `intensity`).
     `noise` is the white sd of one original reading, `bent` the variance of a positional error against its square,
     `bends` that error itself.
     """
@@ -160,16 +161,17 @@ def correlated(
 ) -> Estimate:  # fmt: skip
     """Integrate the unknowns with each channel's white noise at its best value, found by alternation.
 
-    **Arguments:** - `grams`, `logs`: of each channel's whitened columns, in units of its white noise. - `occam`: what
-    the choice of the correlations owes.
+    **Arguments:** - `grams`, `logs`: of each channel's whitened columns, in units of its white noise; those after the
+    unknowns enter with amplitudes of unit variance. - `occam`: what the choice of the correlations owes.
     """
     combination, noise = fits.combinations[b], fits.noise[b].copy()
     free = np.isnan(problem.noise_of(combination))
     for _ in range(6):
-        gram = (grams / (noise**2)[:, None, None]).sum(0)
-        offset = -0.5 * float((number * np.log(2 * np.pi * noise**2) + logs).sum())
+        gram, follow, log = amplitudes_out((grams / (noise**2)[:, None, None]).sum(0), 1 + problem.size)
+        offset = -0.5 * float((number * np.log(2 * np.pi * noise**2) + logs).sum() + log)
         one = _laplace(problem, combination, gram, offset, fits.z[b], priors)
         column = np.concatenate([[1.0], -one.step])
+        column = np.concatenate([column, -follow @ column])
         square = np.einsum("i,jik,k->j", column, grams, column)
         noise = np.where(free, np.sqrt(np.maximum(square, 1e-300) / np.maximum(number, 1)), noise)
     z = fits.z[b] + one.step
@@ -177,6 +179,18 @@ def correlated(
     if (square < 0).any():  # round-off of a trajectory that ran away
         value = -np.inf
     return Estimate(combination, "", z, one.covariance, noise, value, bool(fits.converged[b]))
+
+
+def amplitudes_out(
+    gram: Float[np.ndarray, "column column"], kept: int
+) -> tuple[Float[np.ndarray, "kept kept"], Float[np.ndarray, "rest kept"], float]:
+    """A Gram matrix with the columns after the first `kept`, which enter with amplitudes of unit variance, integrated
+    out; how those amplitudes follow the others, and the log determinant that they leave."""
+    if not np.isfinite(gram).all():  # a trajectory that ran away
+        return np.full((kept, kept), np.nan), np.zeros((len(gram) - kept, kept)), 0.0
+    rest = gram[kept:, kept:] + np.eye(len(gram) - kept)
+    follow = np.linalg.solve(rest, gram[kept:, :kept])
+    return gram[:kept, :kept] - gram[:kept, kept:] @ follow, follow, float(np.linalg.slogdet(rest)[1])
 
 
 def _earned(one: Laplace, fits: Fits, lane: int) -> float:

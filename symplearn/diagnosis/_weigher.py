@@ -16,6 +16,7 @@ from ._problem import MOST, Combination, Problem
 from ._scatter import law_gain, outlier_evidence, outliers, suspects
 from ._score import Start
 from ._start import windows
+from ._static import weigh_static
 from ._strength import strength_gain
 from ._trajectory import Stepper
 from ._weighed import Estimate, standardised, weigh_coloured, weigh_white
@@ -152,17 +153,24 @@ class Weigher:
 
     def weigh_clocks(self, combinations: Sequence[Combination]) -> None:
         """Weigh combinations, fitted before, where the clock may run ahead and behind beside a coloured error."""
-        found = [self.found.of(c, "white") for c in combinations]
-        whites = [one for one in found if one is not None and self.found.of(one.combination, "coloured")]
-        if not whites:
-            return
+        own = [c for c in combinations if self.found.of(c, "coloured")]
+        colours = [one.colours for c in own if (one := self.found.of(c, "coloured"))]
+        if own:
+            for one in weigh_clock(self.problem, self._as_fitted(own), self.found.priors, self.rows, colours):
+                self._add_beside_white(one)
+
+    def weigh_static(self, combinations: Sequence[Combination]) -> None:
+        """Weigh combinations, fitted before, beside a small force that goes with place."""
+        for one in weigh_static(self.stepper, self._as_fitted(combinations), self.found.priors, self.rows):
+            self._add_beside_white(one)
+
+    def _as_fitted(self, combinations: Sequence[Combination]) -> Fits:
+        """Combinations as they were fitted under white noise."""
+        whites = [white for c in combinations if (white := self.found.of(c, "white"))]
         z, own = np.stack([one.z for one in whites]), [one.combination for one in whites]
         predictions = self.stepper.predict(z, own, self.rows)
         noise, converged = np.stack([one.noise for one in whites]), np.array([one.converged for one in whites])
-        fits = Fits(own, z, noise, predictions, np.zeros(len(z)), converged)
-        colours = [one.colours for c in own if (one := self.found.of(c, "coloured"))]
-        for one in weigh_clock(self.problem, fits, self.found.priors, self.rows, colours):
-            self._add_beside_white(one)
+        return Fits(own, z, noise, predictions, np.zeros(len(z)), converged)
 
     def _whites(self, fits: Fits, rows: list[int]) -> np.ndarray:
         """Log evidences under white noise, by lane, with what unfinished fits promise."""

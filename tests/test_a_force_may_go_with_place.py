@@ -1,0 +1,100 @@
+"""A small static force that goes with place is integrated out exactly, and is not taken for one that has a name."""
+
+import engine_cases as cases
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+
+from symplearn.diagnosis._calibrate import calibrate
+from symplearn.diagnosis._effect_priors import with_effects
+from symplearn.diagnosis._motion import motion_along
+from symplearn.diagnosis._start import priors_without_effects
+from symplearn.diagnosis._static import weigh_static
+from symplearn.diagnosis._trajectory import Stepper
+from symplearn.diagnosis._weighed import weigh_white
+
+NOISE, DRAG, TIMES = 0.01, 0.05, np.linspace(0.0, 40.0, 300)
+# Prior sd of the start, wide beside the noise.
+WIDE = 0.3
+
+
+def swing(force=lambda q: 0.0, start=(1.0, 0.0)):
+    """Place and speed of a spring of stiffness 1 with a drag that is known and a further force of place, by SciPy."""
+    return cases.solved(lambda t, x: [x[1], -x[0] - DRAG * x[1] + force(x[0])], start, TIMES)
+
+
+@pytest.fixture(scope="module")
+def weighed():
+    """By force: the readings, and estimates of nothing and of a cubic stiffness under white noise and beside a force of
+    place."""
+
+    def of(force, combinations=("", "cubic_stiffness"), gap=False):
+        y = swing(force)[:, 0] + NOISE * np.random.default_rng(3).normal(size=len(TIMES))
+        y = np.where((TIMES > 8) & (TIMES < 14) & gap, np.nan, y)
+        more = f"[recording.noise]\ny = {NOISE}\n[[terms]]\neffect = 'viscous_damping'\ntarget = 'q'\nc = {DRAG}\n"
+        file = cases.simulation("p**2/2 + q**2/2", observe={"y": "q"}, more=more)
+        p = cases.problem(file, [cases.recorded(TIMES, y)], 0.05)
+        begin = np.zeros(p.size)
+        begin[0] = 1.0
+        bare = priors_without_effects(p)
+        bare.precision[[0, 2]], bare.mean[0] = WIDE**-2.0, 1.0
+        path = np.insert(swing(), 1, 0.0, axis=1)  # with the unseen oscillator that may be added, at rest
+        motion = motion_along(p, begin, [np.insert(path, 3, 0.0, axis=1)])
+        priors = with_effects(p, bare, motion)
+        some = [tuple(m for m in p.searched if p.candidate(m).effect.name == name) for name in combinations]
+        fits = calibrate(Stepper(p), np.stack([begin] * len(some)), some, priors, [len(TIMES)])
+        assert fits.converged.all()
+        kinds = weigh_white(p, fits, priors, [len(TIMES)]), weigh_static(Stepper(p), fits, priors, [len(TIMES)])
+        return y, kinds
+
+    return of
+
+
+def responses():
+    """What a force of each Legendre polynomial does to the place of the spring, to first order, by SciPy."""
+    q = swing()[:, 0]
+
+    def rates(t, x):
+        place = 2 * (x[0] - q.min()) / np.ptp(q) - 1
+        legendre = np.sqrt(2 * np.arange(6) + 1) * np.polynomial.legendre.legvander([place], 5)[0]
+        return np.concatenate([[x[1], -x[0] - DRAG * x[1]], x[8:], -x[2:8] - DRAG * x[8:] + legendre])
+
+    return cases.solved(rates, [1.0, *[0.0] * 13], TIMES)[:, 2:8].T
+
+
+@pytest.mark.parametrize("gap", [False, True])
+def test_it_is_integrated_out(weighed, gap):
+    """What it gains on white noise is what a dense Gaussian process gains whose kernel is made of the responses by
+    SciPy, on average over the sizes of half the noise and less; readings may be missing."""
+    y, ((white, _), (static, _)) = weighed(lambda q: 0.01 * q**5, gap=gap)
+    seen, start = ~np.isnan(y), np.stack([swing(start=one)[:, 0] for one in ((1.0, 0.0), (0.0, 1.0))])
+    error, pushed, moved = (y - start[0])[seen], responses()[:, seen], WIDE * start[:, seen]
+    plain = NOISE**2 * np.eye(len(error)) + moved.T @ moved
+    unit = np.sqrt(len(error) / np.trace(pushed @ np.linalg.solve(plain, pushed.T)))  # leaves as much as the noise
+    some = [plain, *(plain + (size * unit) ** 2 * pushed.T @ pushed for size in (0.5, 0.25, 0.125, 0.0625))]
+    nothing, *logs = [multivariate_normal.logpdf(error, cov=covariance) for covariance in some]
+    expected = logsumexp(logs) - np.log(4) - nothing
+    assert expected > 10
+    # Heavier tails are on offer as well, and gain a fraction of a nat more or less beside either; the range of place is
+    # that of the fitted motion.
+    assert static.log_evidence - white.log_evidence == pytest.approx(expected, abs=0.5)
+
+
+def test_a_name_that_fits_stands_before_it(weighed):
+    """Of a cubic stiffness the name is ahead by nats, and nothing but noise is left beside it."""
+    _, ((nothing, cubic), (static, beside)) = weighed(lambda q: -0.01 * q**3)
+    assert cubic.log_evidence > static.log_evidence + 3 > nothing.log_evidence + 30
+    assert cubic.log_evidence > beside.log_evidence
+
+
+def test_what_has_no_name_is_not_taken_for_a_stiffness(weighed):
+    """Of a force that changes its sign five times on the way, it is ahead of nothing and of a cubic stiffness."""
+    _, ((nothing, cubic), (static, _)) = weighed(lambda q: 0.001 * (63 * q**5 - 70 * q**3 + 15 * q))
+    assert static.log_evidence > max(cubic.log_evidence, nothing.log_evidence) + 10
+
+
+def test_without_a_force_it_gains_nothing(weighed):
+    """Of noise alone it is behind by what it cost to look."""
+    _, ((nothing, _), (static, _)) = weighed(lambda q: 0.0)
+    assert nothing.log_evidence > static.log_evidence
