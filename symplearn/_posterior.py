@@ -222,9 +222,15 @@ def _log_posterior(density, free):
     return density(free)
 
 
-@eqx.filter_jit
 def _values(model, free):
-    """What the model learns at free coordinates (chain, draw, parameter), by name."""
+    """What the model learns at free coordinates (chain, draw, parameter), by name, in the model's order."""
+    found = _sorted_values(model, free)
+    return {name: found[name] for name in named_parameters(model)}
+
+
+@eqx.filter_jit
+def _sorted_values(model, free):
+    """The same in the alphabet's order, in which a compiled function gives a dictionary back."""
     rebuild = flatten(model)[1]
 
     def values(free):

@@ -83,6 +83,13 @@ def test_models_are_the_draws(posterior):
         posterior.models(201)
 
 
+def test_values_come_in_the_models_order(posterior, tmp_path):
+    """The model's noise stands before its start, in the draws and in what is read back, and not by the alphabet."""
+    posterior.save(tmp_path / "draws.nc")
+    for one in (posterior, load_posterior(tmp_path / "draws.nc", posterior.estimate)):
+        assert list(one.values) == ["measurement_noise.structure.variances", "initial.mean"]
+
+
 def test_summaries_are_those_of_the_draws(posterior):
     """Means and quantiles by name are NumPy's of all chains together."""
     flat = np.asarray(posterior.values["initial.mean"]).reshape(-1, 3)
