@@ -3,7 +3,7 @@
 Such a force repeats with the motion, and a part of it is like any stiffness of the vocabulary. It is a random function
 of one coordinate: Legendre polynomials over the range of the motion with independent amplitudes of one size, which
 enter to first order about the trajectory and are integrated out. It is small: what the other unknowns do not take over
-stays below the noise. A larger one is physics that was left out; a stiffness has a name, and fewer unknowns to pay for.
+stays below half of the noise. A larger one is physics that was left out, and a stiffness has a name and fewer unknowns.
 """
 
 from collections.abc import Sequence
@@ -27,8 +27,6 @@ from ._weighed import Estimate, amplitudes_out, correlated, standardised
 _FORCES = (*POWERS, *SHAPES)
 # Sizes that are tried: root mean squares that the force leaves in the readings, against their noise.
 _SIZES = (0.0625, 0.125, 0.25, 0.5)
-
-
 # Share of a response that the other unknowns leave, below which it is round-off.
 _ROUND_OFF = 1e-9
 
