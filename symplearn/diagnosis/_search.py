@@ -361,7 +361,7 @@ class Search:
         """The best combinations again beside a force that goes with place, which any of their forces may stand for; not
         nothing: alone such a force is no remainder."""
         ranked = sorted(self.found.estimates, key=self.found.odds, reverse=True)
-        if ranked[0] != self.base:
+        if ranked[0] != self.base and self._in_time():
             self.progress("weighing small forces that go with place")
             top = self.found.odds(ranked[0])
             near = [c for c in ranked if self.found.odds(c) > top - _REACH][:_AGAIN]
