@@ -3,6 +3,7 @@
 import engine_cases as cases
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
@@ -31,24 +32,24 @@ def weighed():
     """By force: the readings, and estimates of nothing and of a cubic stiffness under white noise and beside a force of
     place."""
 
-    def of(force, combinations=("", "cubic_stiffness"), gap=False):
-        y = swing(force)[:, 0] + NOISE * np.random.default_rng(3).normal(size=len(TIMES))
-        y = np.where((TIMES > 8) & (TIMES < 14) & gap, np.nan, y)
+    def of(force, combinations=("", "cubic_stiffness"), gap=(0, 0), lengths=(300,)):
+        rng, lacks = np.random.default_rng(3), (TIMES > gap[0]) & (TIMES < gap[1])
+        ys = [np.where(lacks, np.nan, swing(force)[:, 0] + NOISE * rng.normal(size=len(TIMES)))[:n] for n in lengths]
         more = f"[recording.noise]\ny = {NOISE}\n[[terms]]\neffect = 'viscous_damping'\ntarget = 'q'\nc = {DRAG}\n"
         file = cases.simulation("p**2/2 + q**2/2", observe={"y": "q"}, more=more)
-        p = cases.problem(file, [cases.recorded(TIMES, y)], 0.05)
-        begin = np.zeros(p.size)
-        begin[0] = 1.0
-        bare = priors_without_effects(p)
-        bare.precision[[0, 2]], bare.mean[0] = WIDE**-2.0, 1.0
+        runs = [cases.recorded(TIMES[: len(y)], y, number=k) for k, y in enumerate(ys, start=1)]
+        p = cases.problem(file, runs, 0.05)
+        begin, bare = np.zeros(p.size), priors_without_effects(p)
+        for k in range(0, p.head, p.state):
+            begin[k] = bare.mean[k] = 1.0
+            bare.precision[[k, k + 2]] = WIDE**-2.0
         path = np.insert(swing(), 1, 0.0, axis=1)  # with the unseen oscillator that may be added, at rest
-        motion = motion_along(p, begin, [np.insert(path, 3, 0.0, axis=1)])
+        motion = motion_along(p, begin, [np.insert(path, 3, 0.0, axis=1)[:n] for n in lengths])
         priors = with_effects(p, bare, motion)
         some = [tuple(m for m in p.searched if p.candidate(m).effect.name == name) for name in combinations]
-        fits = calibrate(Stepper(p), np.stack([begin] * len(some)), some, priors, [len(TIMES)])
+        fits = calibrate(Stepper(p), np.stack([begin] * len(some)), some, priors, lengths)
         assert fits.converged.all()
-        kinds = weigh_white(p, fits, priors, [len(TIMES)]), weigh_static(Stepper(p), fits, priors, [len(TIMES)])
-        return y, kinds
+        return ys, (weigh_white(p, fits, priors, list(lengths)), weigh_static(Stepper(p), fits, priors, lengths))
 
     return of
 
@@ -65,13 +66,16 @@ def responses():
     return cases.solved(rates, [1.0, *[0.0] * 13], TIMES)[:, 2:8].T
 
 
-@pytest.mark.parametrize("gap", [False, True])
-def test_it_is_integrated_out(weighed, gap):
+@pytest.mark.parametrize(("gap", "lengths"), [((0, 0), (300,)), ((8, 14), (300,)), ((0, 0), (200, 300))])
+def test_it_is_integrated_out(weighed, gap, lengths):
     """What it gains on white noise is what a dense Gaussian process gains whose kernel is made of the responses by
-    SciPy, on average over the sizes of half the noise and less; readings may be missing."""
-    y, ((white, _), (static, _)) = weighed(lambda q: 0.01 * q**5, gap=gap)
-    seen, start = ~np.isnan(y), np.stack([swing(start=one)[:, 0] for one in ((1.0, 0.0), (0.0, 1.0))])
-    error, pushed, moved = (y - start[0])[seen], responses()[:, seen], WIDE * start[:, seen]
+    SciPy, on average over the sizes of half the noise and less; readings may be missing, and recordings several."""
+    ys, ((white, _), (static, _)) = weighed(lambda q: 0.01 * q**5, gap=gap, lengths=lengths)
+    y, start = np.concatenate(ys), np.stack([swing(start=one)[:, 0] for one in ((1.0, 0.0), (0.0, 1.0))])
+    seen = ~np.isnan(y)
+    error = (y - np.concatenate([start[0, :n] for n in lengths]))[seen]
+    pushed = np.concatenate([responses()[:, :n] for n in lengths], axis=1)[:, seen]
+    moved = WIDE * block_diag(*(start[:, :n] for n in lengths))[:, seen]
     plain = NOISE**2 * np.eye(len(error)) + moved.T @ moved
     unit = np.sqrt(len(error) / np.trace(pushed @ np.linalg.solve(plain, pushed.T)))  # leaves as much as the noise
     some = [plain, *(plain + (size * unit) ** 2 * pushed.T @ pushed for size in (0.5, 0.25, 0.125, 0.0625))]

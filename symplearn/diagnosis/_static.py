@@ -36,7 +36,7 @@ class _Push:
     """A force of place on one coordinate: what a unit of each shape does to all readings, by recording; Gram matrices
     of [error, slopes, responses] by channel, the last in units of `scale`, the size of each shape's amplitude."""
 
-    responses: Sequence[Float[np.ndarray, "amplitude row channel"]]
+    responses: Sequence[Float[np.ndarray, "amplitude _ channel"]]
     grams: Float[np.ndarray, "channel column column"]
     scale: float
 
@@ -69,7 +69,7 @@ def weigh_static(stepper: Stepper, fits: Fits, priors: Priors, rows: Sequence[in
 
 def _responses(
     stepper: Stepper, fits: Fits, rows: Sequence[int]
-) -> list[list[list[Float[np.ndarray, "amplitude row channel"]]]]:
+) -> list[list[list[Float[np.ndarray, "amplitude _ channel"]]]]:
     """Of all readings to a force of every shape, by lane, coordinate and recording."""
     problem, number = stepper.problem, stepper.problem.equations.declared
     units = [[Unit(_candidate(problem, k, i), None) for k in range(len(_FORCES))] for i in range(number)]
