@@ -82,9 +82,9 @@ def test_it_is_integrated_out(weighed, gap, lengths):
     nothing, *logs = [multivariate_normal.logpdf(error, cov=covariance) for covariance in some]
     expected = logsumexp(logs) - np.log(4) - nothing
     assert expected > 10
-    # Heavier tails are on offer as well, and gain a fraction of a nat more or less beside either; the range of place is
-    # that of the fitted motion.
-    assert static.log_evidence - white.log_evidence == pytest.approx(expected, abs=0.5)
+    # Seen: 0.02 to 0.06 of 15 to 44. Heavier tails are on offer beside either, and the shapes go over the range of the
+    # fitted motion, here of the true one.
+    assert static.log_evidence - white.log_evidence == pytest.approx(expected, abs=0.2)
 
 
 def test_a_name_that_fits_stands_before_it(weighed):

@@ -228,8 +228,8 @@ def test_beside_a_finding_a_remainder_has_a_quarter(problem):
     kinds = [estimate(problem, one, value, kind) for kind, value in values.items()]
     p = posterior(problem, found(problem, *nothing, *kinds), 1.0)
     expected = DAMPING * sum(shares[kind] * np.exp(value) for kind, value in values.items())
-    assert p.named[0].probability / p.as_it_is == pytest.approx(expected, rel=1e-9)
-    assert p.unexplained / p.as_it_is == pytest.approx(1 / FAMILIES, rel=1e-9)
+    assert p.named[0].probability / p.as_it_is == pytest.approx(expected, rel=ROUND_OFF)
+    assert p.unexplained / p.as_it_is == pytest.approx(1 / FAMILIES, rel=ROUND_OFF)
     assert p.named[0].best.kind == "coloured"
 
 

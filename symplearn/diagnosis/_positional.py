@@ -17,7 +17,7 @@ from ._calibrate import Fits, Priors, residuals, weights
 from ._evidence import variance_inflation
 from ._problem import Problem
 from ._scatter import factor_evidence, law_gain
-from ._weighed import REMAINDER, Estimate, correlated
+from ._weighed import REMAINDER, Estimate, amplitudes_out, correlated
 
 # Variances of the error against the noise's that are tried.
 _RATIOS = np.geomspace(0.03, 1e4, 12)
@@ -45,12 +45,10 @@ class _Channel:
 
     def marginal(self, ratio: float) -> tuple[np.ndarray, float]:
         """Gram matrix of the plain columns with the polynomials integrated out, and the log determinant they leave."""
-        gram = self.gram
-        first, rest = slice(None, self.plain), slice(self.plain, None)
-        held = gram[rest, rest] + np.eye(len(gram) - self.plain) * (len(gram) - self.plain) / ratio
-        taken = gram[first, rest] @ np.linalg.solve(held, gram[rest, first])
-        determinant = np.linalg.slogdet(held * ratio / (len(gram) - self.plain))[1]
-        return gram[first, first] - taken, float(determinant) - self.log_weights
+        number = len(self.columns) - self.plain
+        unit = np.where(np.arange(len(self.columns)) < self.plain, 1.0, np.sqrt(ratio / number))
+        gram, _, log = amplitudes_out(self.gram * np.outer(unit, unit), self.plain)
+        return gram, log - self.log_weights
 
     def cleared(self, ratio: float) -> Float[np.ndarray, "column row"]:
         """The plain columns without what the polynomials take of them."""

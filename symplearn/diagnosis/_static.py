@@ -3,7 +3,7 @@
 Such a force repeats with the motion, and a part of it is like any stiffness of the vocabulary. It is a random function
 of one coordinate: Legendre polynomials over the range of the motion with independent amplitudes of one size, which
 enter to first order about the trajectory and are integrated out. It is small: what the other unknowns do not take over
-stays below half of the noise. A larger one is physics that was left out, and a stiffness has a name and fewer unknowns.
+has a prior rms of half the noise at most. A larger one is physics that was left out, and a stiffness has a name.
 """
 
 from collections.abc import Sequence

@@ -256,9 +256,12 @@ class Stepper:
     def _beside(self, lanes: Sequence[tuple[np.ndarray, Combination, Any]], r: int) -> tuple[np.ndarray, np.ndarray]:
         """Unknowns and coefficients of lanes that move as a combination does and have further effects."""
         p = self.problem
-        some, hots = [], []
+        some, hots, motions = [], [], dict[tuple[int, Combination], np.ndarray]()
         for z, combination, (values, matrix, _) in lanes:
-            fixed = p.coefficients(r, z, combination) - p.coefficients(r, z, ())
+            fixed = motions.get((id(z), combination))
+            if fixed is None:  # most lanes share a motion
+                fixed = p.coefficients(r, z, combination) - p.coefficients(r, z, ())
+                motions[id(z), combination] = fixed
             own = z[p.local(r)].copy()
             own[self._further :] = values
             hot = matrix.copy()
