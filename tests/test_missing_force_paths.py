@@ -75,9 +75,10 @@ def effects(problem):
 
 
 class Dense:
-    """Everything by one Gaussian over [x_0 of both runs, f, constant force, bias, all white forces]."""
+    """Everything by one Gaussian over [x_0 of both runs, f, constant force, bias, all white forces]; `acting` says in
+    which share of each span, by run, they act."""
 
-    def __init__(self, problem, intensity, named, noise=NOISE):
+    def __init__(self, problem, intensity, named, noise=NOISE, acting=None):
         runs, unknowns = problem.rows, 2 * len(problem.rows) + (3 if named else 1)
         columns = unknowns + sum(2 * (len(r.times) - 1) for r in runs)
         mean, variance = np.zeros(columns), np.zeros((columns, columns))
@@ -105,7 +106,8 @@ class Dense:
                     if named:
                         x[:, 5] += b
                     x[:, first : first + 2] = np.eye(2)
-                    variance[first : first + 2, first : first + 2] = _simpson(A, intensity, gap)
+                    here = intensity * (1.0 if acting is None else acting[r][k])
+                    variance[first : first + 2, first : first + 2] = _simpson(A, here, gap)
                     first += 2
         H, states = np.array(rows), np.array(states)
         S = H @ variance @ H.T + noise**2 * np.eye(len(ys))
@@ -184,6 +186,22 @@ def test_the_path_is_the_dense_smoothers(stepper, fits, lane, intensity, named):
     dense = Dense(stepper.problem, intensity, named)
     for found, expected in zip(fits[lane].paths, dense.paths, strict=True):
         np.testing.assert_allclose(found[:, STATE], expected, atol=1e-5)
+
+
+def test_a_force_that_acts_for_a_while_is_dense_too(stepper, priors):
+    """A force in a few spans of the second run: evidence, unknowns and path equal one Gaussian's."""
+    p = stepper.problem
+    acting = (np.zeros(N), np.zeros(SHORT))
+    acting[1][6:10], acting[1][10] = 1.0, 0.5
+    begin = replace(start(p, 1.0, effects(p)), exposures=acting)
+    (found,) = fit_paths(stepper, [begin], priors, ROWS)
+    dense = Dense(p, 1.0, True, acting=acting)
+    np.testing.assert_allclose(found.log_evidence, dense.log_evidence, atol=1e-4)
+    np.testing.assert_allclose(found.z[UNKNOWN], dense.mean[:7], atol=1e-5)
+    for path, expected in zip(found.paths, dense.paths, strict=True):
+        np.testing.assert_allclose(path[:, STATE], expected, atol=1e-5)
+    # That it acts there and nowhere else matters: the same force always at work is nats away.
+    assert abs(dense.log_evidence - Dense(p, 1.0, True).log_evidence) > 1.0
 
 
 def errors_of(problem, fits):

@@ -10,7 +10,7 @@ import pytest
 from symplearn._effects import prices, vocabulary
 from symplearn.diagnosis._calibrate import Priors
 from symplearn.diagnosis._document import told_apart
-from symplearn.diagnosis._found import Found
+from symplearn.diagnosis._found import Ahead, Found
 from symplearn.diagnosis._posterior import posterior
 from symplearn.diagnosis._weighed import Estimate
 
@@ -37,7 +37,7 @@ DAMPING, GAIN = 1 / (FAMILIES * 4 * 2), 1 / (FAMILIES * 5 * 2)  # of a drag on a
 ONE_TARGET = {"relative_damping", "coupling_spring", "central_correction", "gyroscopic_coupling",
               "parametric_modulation", "parameter_drift", "regime_change", "parameter_error"}  # fmt: skip
 
-KINDS = ("white", "coloured", "clock", "positional", "static", "force")
+KINDS = ("white", "coloured", "clock", "positional", "static", "force", "spell")
 
 
 @pytest.fixture(scope="module")
@@ -223,14 +223,38 @@ def test_beside_a_finding_a_remainder_has_a_quarter(problem):
     """Of an effect's price, three quarters go to white noise alone and one to the kinds of remainder, which share it. A
     kind that gains more than the effect does has the price of `any` there, as all have without a finding."""
     one, nothing = (place(problem, "viscous_damping", "q1"),), [estimate(problem, (), 0.0, kind) for kind in KINDS]
-    values = dict(zip(KINDS, (2.0, 5.0, 3.5, 3.0, -1.0, 3.0), strict=True))
-    shares = dict(zip(KINDS, (3 / 4, 1 / FAMILIES / 5, *[1 / 4 / 5] * 4), strict=True))
+    values = dict(zip(KINDS, (2.0, 5.0, 3.5, 3.0, -1.0, 3.0, 2.5), strict=True))
+    shares = dict(zip(KINDS, (3 / 4, 1 / FAMILIES / 6, *[1 / 4 / 6] * 5), strict=True))
     kinds = [estimate(problem, one, value, kind) for kind, value in values.items()]
     p = posterior(problem, found(problem, *nothing, *kinds), 1.0)
     expected = DAMPING * sum(shares[kind] * np.exp(value) for kind, value in values.items())
     assert p.named[0].probability / p.as_it_is == pytest.approx(expected, rel=ROUND_OFF)
     assert p.unexplained / p.as_it_is == pytest.approx(1 / FAMILIES, rel=ROUND_OFF)
     assert p.named[0].best.kind == "coloured"
+
+
+@pytest.mark.parametrize("holds", [True, False])
+def test_findings_that_explain_less_than_they_leave_must_go_on_ahead(problem, holds):
+    """Of an effect that gains 2 nats beside a coloured error that gains 3, that part counts as unexplained where the
+    fit does not go on ahead; beside remainders that gain less it is the effect all the same."""
+    one, nothing = (place(problem, "viscous_damping", "q1"),), [estimate(problem, (), 0.0, kind) for kind in KINDS]
+    values = {"white": 2.0, "coloured": 5.0, "clock": 3.0}
+    kept = found(problem, *nothing, *(estimate(problem, one, value, kind) for kind, value in values.items()))
+    kept.ahead = {(): Ahead(0.0, True), one: Ahead(0.0, holds)}
+    p = posterior(problem, kept, 1.0)
+    small, large = 3 / 4 * np.exp(2.0) + 1 / 4 / 6 * np.exp(3.0), 1 / FAMILIES / 6 * np.exp(5.0)
+    mine, rest = (small + large, 0.0) if holds else (small, large)
+    assert p.named[0].probability / p.as_it_is == pytest.approx(DAMPING * mine, rel=ROUND_OFF)
+    assert p.unexplained / p.as_it_is == pytest.approx(1 / FAMILIES + DAMPING * rest, rel=ROUND_OFF)
+
+
+def test_how_a_trajectory_goes_on_says_nothing_of_a_spell(problem):
+    """A score ahead counts for every kind of remainder but the force that acts for a while."""
+    nothing, one = [estimate(problem, (), 0.0, kind) for kind in KINDS], (place(problem, "viscous_damping", "q1"),)
+    kept = found(problem, *nothing, *alike(problem, one, 0.0))
+    kept.ahead = {(): Ahead(-4.0, False), one: Ahead(0.0, True)}
+    p = posterior(problem, kept, 1.0)
+    assert p.unexplained / p.as_it_is == pytest.approx(np.mean([*[1.0] * 5, np.exp(4.0)]) / FAMILIES, rel=1e-9)
 
 
 def test_what_the_recording_says_nothing_of_is_not_weighed(problem):

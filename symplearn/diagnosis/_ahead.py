@@ -30,7 +30,7 @@ _HOLDS = 3.0
 def look_ahead(stepper: Stepper, found: Found, rows: Sequence[int]) -> None:
     """Keep what the likeliest combinations score, where the best leaves a clear remainder; else nothing."""
     ranked = sorted(found.estimates, key=found.odds, reverse=True)
-    top = found.best(ranked[0])
+    top = max(e.log_evidence for e in found.estimates[ranked[0]] if e.kind != "spell")
     white = max(e.log_evidence for es in found.estimates.values() for e in es if e.kind == "white")
     if not np.isfinite(top) or top < white + _CLEAR:
         return

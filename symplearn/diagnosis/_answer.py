@@ -20,6 +20,7 @@ from ._locate import (
     kind_and_targets,
     motion,
     present_windows,
+    spell_windows,
     strained_coordinates,
     strained_windows,
     where_sentence,
@@ -63,8 +64,8 @@ class Answer:
         self.after, self.run = self._after()
         # Shown before: the calibrated simulation as it is, which knows no missing force.
         plain = found.of((), "white") or self.before
-        self.without = self._outlooks(plain, intensity_of(stepper, plain))
-        self.with_ = self._outlooks(self.run, intensity_of(stepper, self.run)) if self.chosen else self.without
+        self.without = self._outlooks(plain)
+        self.with_ = self._outlooks(self.run) if self.chosen else self.without
         self.pull = self._missing_force()
         self.lens = self._lenses(self.pull or self.before)
         self.lens_after = self._lenses(self.after)
@@ -96,14 +97,16 @@ class Answer:
             return None, "unexplained"
         return ranked[0], "mismatch"
 
-    def _outlooks(self, estimate: Estimate, intensity: np.ndarray) -> list[Outlook]:
-        return [Outlook(self.stepper, estimate, r, intensity) for r in range(len(self.problem.rows))]
+    def _outlooks(self, estimate: Estimate) -> list[Outlook]:
+        """Under the remainder that it was fitted with."""
+        own = intensity_of(self.stepper, estimate), estimate.exposures
+        return [Outlook(self.stepper, estimate, r, *own) for r in range(len(self.problem.rows))]
 
     def _lenses(self, estimate: Estimate) -> list[Outlook]:
         """Outlooks with the missing force of the simulation without effects: before and after through one lens."""
         if self.pull is None or self.pull.intensity is None:
-            return self._outlooks(estimate, intensity_of(self.stepper, estimate))
-        return self._outlooks(estimate, self.pull.intensity)
+            return self._outlooks(estimate)
+        return [Outlook(self.stepper, estimate, r, self.pull.intensity) for r in range(len(self.problem.rows))]
 
     def diagnosis(self, seconds: float) -> Diagnosis:
         f, eq, values = self.file, self.problem.equations, self.values
@@ -295,8 +298,12 @@ class Answer:
         else:
             strained = strained_coordinates(self.lens)
             kind, targets = "dynamics", [eq.coordinates[i] for i in strained]
-            where = where_sentence(self.problem, self.lens[0], strained[0])
-            found = [(w, o.recording + 1) for o in self.lens for w in strained_windows(o, strained[0])]
+            if self.before.exposures is not None:
+                where = f"something pulls on {targets[0]} for a while, and neither before nor after"
+                found = [(w, r + 1) for r, w in spell_windows(self.problem, self.before.exposures)]
+            else:
+                where = where_sentence(self.problem, self.lens[0], strained[0])
+                found = [(w, o.recording + 1) for o in self.lens for w in strained_windows(o, strained[0])]
             windows = [[*w, r] if several else w for w, r in found]
         numbers = list(range(1, len(self.lens) + 1))
         return {"kind": kind, "targets": targets, "recordings": numbers, "time_windows": windows, "where": where}

@@ -19,7 +19,7 @@ from ._bend import bent
 from ._outlook import colour_ratio, intensity_of, start_spread, total_noise
 from ._problem import Problem
 from ._record import Forecast
-from ._stochastic import filter_lane, padded, row_roots, run_lane, softness
+from ._stochastic import exposure, filter_lane, padded, row_roots, run_lane, softness
 from ._taught import root_of, taught
 from ._trajectory import Stepper, effect_coefficients, model_at
 from ._weighed import Estimate
@@ -82,8 +82,10 @@ def _expected(
     else:
         ends, log_weights = _filtered(stepper, e, zs, state_key), np.zeros(len(units))
     ahead = _ahead(stepper.problem, recording, times)
+    # A force that has acted for a while is over.
+    pushed = intensity_of(stepper, e) * (e.exposures is None)
     drawn = _run_on(*_model(stepper), zs, ends, jnp.asarray(stepper.problem.onehot(e.combination, 0)),
-                    jnp.asarray(intensity_of(stepper, e)), ahead, jax.random.split(push_key, len(units)))  # fmt: skip
+                    jnp.asarray(pushed), ahead, jax.random.split(push_key, len(units)))  # fmt: skip
     return _summary(bent(np.asarray(drawn), e.bends), log_weights, about_first=e.intensity is None)
 
 
@@ -107,7 +109,7 @@ def _filtered(stepper: Stepper, e: Estimate, zs: Array, key: Array) -> Array:
     """Draws of the phase point at the last row under a missing force, each filtered through all rows."""
     problem, course = stepper.problem, stepper.courses[0]
     length = course.times.shape[0]
-    fixed = (total_noise(e), intensity_of(stepper, e), softness(problem, course, e.z, 0), start_spread(stepper, e, 0),
+    fixed = (total_noise(e), intensity_of(stepper, e), exposure(e.exposures, 0, length), softness(problem, course, e.z, 0), start_spread(stepper, e, 0),
              padded(problem.rows[0].readings, length, np.nan), row_roots(problem, 0, length, colour_ratio(e)),
              problem.onehot(e.combination, 0))  # fmt: skip
     keys = jax.random.split(key, len(zs))
@@ -158,14 +160,14 @@ def _run_through(equations: Any, integrator: Any, course: Any, zs: Array, onehot
 @eqx.filter_jit
 def _filter_through(equations: Any, integrator: Any, course: Any, zs: Array, fixed: Any, keys: Array) -> Array:
     """A draw of the phase point at the last row for every draw of the parameters, filtered through all rows."""
-    noise, intensity, soft, spread, readings, roots, onehot = fixed
+    noise, intensity, exposed, soft, spread, readings, roots, onehot = fixed
     state, f = 2 * equations.width, course.to_parameters.shape[0]
 
     def one(z: Array, key: Array) -> Array:
         calibrated, coefficients = z[state : state + f], effect_coefficients(z[state + f :], onehot)
         _, _, _, filtered = filter_lane(
-            equations, integrator, course, calibrated, coefficients, noise, intensity, soft, z[:state], spread,
-            readings, roots,
+            equations, integrator, course, calibrated, coefficients, noise, intensity, exposed, soft, z[:state],
+            spread, readings, roots,
         )  # fmt: skip
         root = semidefinite_cholesky(filtered.filtered_covariances[-1])
         return filtered.filtered_means[-1] + root @ jax.random.normal(key, (state,))

@@ -74,6 +74,14 @@ def strained_windows(outlook: Outlook, coordinate: int) -> list[list[float]]:
     return windows
 
 
+def spell_windows(problem: Problem, exposures: Sequence[np.ndarray]) -> list[tuple[int, list[float]]]:
+    """The recording, and from when to when, of a missing force that acts for a while."""
+    acting = [(r, np.flatnonzero(each)) for r, each in enumerate(exposures) if each.any()]
+    times = [problem.rows[r].times for r, _ in acting]
+    return [(r, [float(t[spans[0]]), float(t[min(spans[-1] + 1, len(t) - 1)])])
+            for (r, spans), t in zip(acting, times, strict=True)]  # fmt: skip
+
+
 def strained_coordinates(outlooks: Sequence[Outlook]) -> list[int]:
     """Coordinates whose equation is strained, the worst first; at least one."""
     level = np.mean([(o.strain() ** 2).mean(0) for o in outlooks], axis=0)

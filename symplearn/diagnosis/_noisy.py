@@ -12,7 +12,7 @@ from ._calibrate import Priors, weights
 from ._evidence import Laplace, laplace
 from ._path import backward_lanes, forward_lanes
 from ._problem import Combination, Problem
-from ._stochastic import padded
+from ._stochastic import exposure, padded
 from ._trajectory import LANES, Stepper, switches_of
 
 # Steps towards a smaller or larger reading noise are lengthened this much: plain EM is slow where noise is small.
@@ -23,7 +23,11 @@ _SETTLED = 0.05
 
 @dataclass(frozen=True)
 class PathFit:
-    """One combination under one intensity of the missing force: unknowns, noise, path by recording, evidence."""
+    """One combination under one intensity of the missing force: unknowns, noise, path by recording, evidence.
+
+    `exposures` holds the share of each span in which the force acts, by recording, None where it always does; `choices`
+    is the log of how many such spells this one was chosen from.
+    """
 
     combination: Combination
     intensity: Float[np.ndarray, " d"]
@@ -34,6 +38,8 @@ class PathFit:
     converged: bool = False
     errors: Float[np.ndarray, "row channel"] | None = None  # innovations by their own sd, NaN where nothing was read
     left_out: tuple[Bool[np.ndarray, "_ channel"], ...] | None = None  # readings that this fit does not use
+    exposures: tuple[Float[np.ndarray, " _"], ...] | None = None
+    choices: float = 0.0
 
     def used(self, r: int, weight: Float[np.ndarray, "time channel"]) -> Float[np.ndarray, "time channel"]:
         """Weights of the readings that this fit uses."""
@@ -157,6 +163,7 @@ def _pass(stepper, fits: list[PathFit], r: int, rows: int, weight: np.ndarray, s
         jax.device_put(padded(problem.rows[r].readings[:rows], length, np.nan)),
         given,
         jax.device_put(np.stack([fit.intensity for fit in fits])),
+        jax.device_put(np.stack([exposure(fit.exposures, r, length) for fit in fits])),
         switches_of(problem, r, hots),
     )
     return linear, given, done

@@ -69,6 +69,7 @@ class Outlook:
     estimate: Estimate
     recording: int
     intensity: Float[np.ndarray, " d"]
+    exposures: tuple[np.ndarray, ...] | None = None  # where the missing force does not always act
 
     @property
     def rows(self) -> Any:
@@ -80,6 +81,7 @@ class Outlook:
         return run_filter(
             self.stepper.problem, self.stepper.courses[r], r, e.z, e.combination, total_noise(e), colour_ratio(e),
             self.intensity, start_spread(self.stepper, e, r), self._straight[: self.rows.fitted],
+            self.exposures,
         )  # fmt: skip
 
     @cached_property

@@ -154,17 +154,21 @@ def backward(linear: Linear, done: Pass, variances: Array, delta: Array) -> Smoo
 
 @eqx.filter_jit
 def forward_lanes(
-    equations, integrator, course, paths, calibrated, slots, onehots, readings, variances, intensities, switches
-):
-    """Linearise and filter every lane over the leading rows that `paths` (lane, time, state) covers."""
+    equations, integrator, course, paths, calibrated, slots, onehots, readings, variances, intensities, exposures,
+    switches,
+):  # fmt: skip
+    """Linearise and filter every lane over the leading rows that `paths` (lane, time, state) covers.
+
+    `exposures` (lane, time) is the share of each span in which the missing force acts.
+    """
     lengths = course.spans.length
     n = paths.shape[1]
 
-    def lane(path, c, s, onehot, r, q):
+    def lane(path, c, s, onehot, r, q, exposure):
         linear = linearise(equations, integrator, course, path, c, s, onehot, readings, switches)
-        return linear, forward(linear, r, q, lengths[:n])
+        return linear, forward(linear, r, q, lengths[:n] * exposure)
 
-    return jax.vmap(lane)(paths, calibrated, slots, onehots, variances, intensities)
+    return jax.vmap(lane)(paths, calibrated, slots, onehots, variances, intensities, exposures)
 
 
 backward_lanes = eqx.filter_jit(jax.vmap(backward))

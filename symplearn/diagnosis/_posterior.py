@@ -1,9 +1,10 @@
 """From evidences to probabilities: the contract's prior, the price of a combination, tempering under misfit."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from .._effects import HIDDEN, Oscillating
 from ._found import Found, speaker
@@ -18,7 +19,7 @@ CONSISTENT = 0.05
 # Prior share of a remainder beside findings: as many cases as issue 6 would have carry one.
 _BESIDE = 0.25
 # Kinds of remainder other than white noise, which divide its prior among them.
-_REMAINDERS = ("coloured", "clock", "positional", "static", "force")
+_REMAINDERS = ("coloured", "clock", "positional", "static", "force", "spell")
 
 
 @dataclass(frozen=True)
@@ -64,16 +65,23 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     evidences: dict[Combination, float] = {}
     for combination, estimates in found.estimates.items():
         tempered = {e.kind: top + factor * (e.log_evidence - top) for e in estimates}
-        plain = tempered.get("white", -np.inf)
-        noisy = _beside_a_remainder(tempered, least if combination else np.inf, remainder)
+        # How a trajectory goes on says nothing of a force that acts for a while.
         ahead = found.ahead[combination].score if combination in found.ahead else unseen
-        plain, noisy = plain + ahead, noisy + ahead
-        total = float(np.logaddexp(plain + np.log(1.0 - _BESIDE), noisy))
-        evidences[combination] = total if combination else max(plain, noisy - np.log(remainder))
+        tempered = {kind: value + ahead * (kind != "spell") for kind, value in tempered.items()}
+        plain = tempered.get("white", -np.inf)
+        small, large = _beside_a_remainder(tempered, least if combination else np.inf, remainder)
         if not combination:
-            white, other = plain, noisy
-        elif any(e.converged for e in estimates) and _informed(problem, found, combination):
-            named.append((combination, found.prices.log(combination), total, speaker(estimates)))
+            white, other = plain, float(np.logaddexp(other, large))
+            evidences[combination] = max(plain, large - np.log(remainder))
+            continue
+        total = evidences[combination] = float(np.logaddexp.reduce([plain + np.log(1.0 - _BESIDE), small, large]))
+        if any(e.converged for e in estimates) and _informed(problem, found, combination):
+            price = found.prices.log(combination)
+            # What explains less than is left beside it, and does not go on ahead, is not what was left out.
+            if combination in found.ahead and not found.ahead[combination].holds:
+                other = float(np.logaddexp(other, price + large))
+                total = float(np.logaddexp(plain + np.log(1.0 - _BESIDE), small))
+            named.append((combination, price, total, speaker(estimates)))
     with np.errstate(divide="ignore"):
         faint = white + np.log(_unseen(problem, found))
     logs = np.array([white, other, faint, *(w + total for _, w, total, _ in named)])
@@ -92,17 +100,18 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
 
 
 @np.errstate(invalid="ignore")  # where neither has an evidence, which gains more does not matter
-def _beside_a_remainder(tempered: Mapping[str, float], least: float, price: float) -> float:
-    """Log evidence of a combination beside a remainder, prior of the remainder included; `least` is that of nothing.
+def _beside_a_remainder(tempered: Mapping[str, float], least: float, price: float) -> tuple[float, float]:
+    """Log evidence of a combination beside a small remainder, and beside a large one, prior of the remainder included;
+    `least` is that of nothing.
 
     Real systems often keep a small one. But one that gains more than the findings do is not small beside them: it has
     the contract's price of what has no name, as it has without findings.
     """
-    logs = []
-    for kind in _REMAINDERS:
-        value, white = tempered.get(kind, -np.inf), tempered.get("white", -np.inf)
-        logs.append(value + np.log(_BESIDE if white - least >= value - white else price))
-    return _mixture(logs)
+    white = tempered.get("white", -np.inf)
+    values = np.array([tempered.get(kind, -np.inf) for kind in _REMAINDERS])
+    small = white - least >= values - white
+    parts = np.where(small, values + np.log(_BESIDE), -np.inf), np.where(small, -np.inf, values + np.log(price))
+    return _mixture(parts[0]), _mixture(parts[1])
 
 
 def _unseen(problem: Problem, found: Found) -> float:
@@ -127,10 +136,9 @@ def _faint(problem: Problem, found: Found, combination: Combination) -> float | 
     return faint_share(sd) if sd < _UNINFORMED else None
 
 
-def _mixture(values: Sequence[float]) -> float:
+def _mixture(values: Float[np.ndarray, " kind"]) -> float:
     """Log of the mean of exponentials."""
-    top = max(values)
-    return float(top + np.log(np.mean(np.exp(np.array(values) - top)))) if np.isfinite(top) else -np.inf
+    return float(np.logaddexp.reduce(values) - np.log(len(values)))
 
 
 def _informed(problem: Problem, found: Found, combination: Combination) -> bool:

@@ -17,6 +17,7 @@ from ._problem import MOST, Combination, Problem
 from ._prospects import MANY, Prospects, promising
 from ._refinement import Refinement
 from ._score import Start
+from ._spells import spells
 from ._start import priors_without_effects, with_states
 from ._stochastic import free_run
 from ._trajectory import LANES, Stepper
@@ -100,6 +101,7 @@ class Search:
             self.refinement.weigh_beside_the_remainder()
         self.progress("weighing missing forces beside the best combinations")
         self._weigh_forces()
+        self._weigh_spells()
         self.weigher.weigh_with_outliers_in()
         return self.found
 
@@ -187,6 +189,7 @@ class Search:
         self._weigh_clocks()
         self._weigh_static()
         self._weigh_forces()
+        self._weigh_spells()
         w.weigh_with_outliers_in()
         return self.found
 
@@ -375,6 +378,17 @@ class Search:
         kinds = {e.kind: e.log_evidence for c in named[:1] for e in self.found.estimates[c]}
         if kinds.pop("force", -np.inf) > max(kinds.values(), default=np.inf):
             self._add_forces(named[1 : KEPT // 2 if self.weigher.is_long else _FORCED], 2)
+
+    def _weigh_spells(self) -> None:
+        """Nothing, and the very best, beside a missing force that acts for a while; not where nothing is left out."""
+        w, best = self.weigher, max(self.found.estimates, key=self.found.odds)
+        white = self.found.of(self.base, "white")
+        lead = np.inf if white is None else self.found.odds(best) - self.found.prices.log(self.base) - white.log_evidence
+        if lead < _WORTH or not self._in_time():  # nothing is left out
+            return
+        pulls = [pull for c in dict.fromkeys([self.base, best]) if (pull := self.found.of(c, "force"))]
+        starts = [start for pull in pulls for start in spells(w.stepper, pull, self.typical, self.rows)]
+        w.add_paths(fit_paths(w.stepper, starts, self.found.priors, self.rows, w.path_steps))
 
     def _add_forces(self, combinations: Sequence[Combination], every: int) -> None:
         starts = []

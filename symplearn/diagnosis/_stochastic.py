@@ -1,5 +1,6 @@
 """The augmented simulation as a state-space model with a white missing force, and its unscented filter."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -26,15 +27,25 @@ class MissingForce(eqx.Module):
     softness: Float[Array, " d"]
     unseen: int = eqx.field(static=True, default=0)
 
-    def covariance(self, span: Span) -> Float[Array, "state state"]:
+    def covariance(self, context: tuple[Span, Array]) -> Float[Array, "state state"]:
+        span, exposure = context
         t = span.length
-        q, w = self.intensity, self.softness
+        q, w = self.intensity * exposure, self.softness
         cross = self._filled(0.5 * w * q * t**2)
         return jnp.block([[self._filled(w**2 * q * t**3 / 3), cross], [cross, self._filled(q * t)]])
 
     def _filled(self, values: Array) -> Array:
         """A diagonal, with nothing for an unseen oscillator."""
         return jnp.diag(jnp.pad(values, (0, self.unseen)))
+
+
+class _Carried(eqx.Module):
+    """A flow over spans that also say in which share of them the missing force acts."""
+
+    inner: Any
+
+    def __call__(self, x: Array, context: tuple[Span, Array]) -> Array:
+        return self.inner(x, context[0])
 
 
 class _RowNoise(eqx.Module):
@@ -57,17 +68,18 @@ class _Scaled(eqx.Module):
 
 
 def filter_lane(
-    equations, integrator, course, calibrated, coefficients, noise, intensity, soft, x, spread, readings, roots
+    equations, integrator, course, calibrated, coefficients, noise, intensity, exposure, soft, x, spread, readings, roots
 ) -> tuple[StateSpaceModel, Any, Any, Filtered]:
     """Filter the leading rows that `readings` covers from N(x, spread); also the model and what it was given.
 
-    `noise` is that of one original reading; `roots` (time, channel) the root of each row's information in its units.
+    `noise` is that of one original reading; `roots` (time, channel) the root of each row's information in its units;
+    `exposure` (time,) the share of each span in which the missing force acts.
     """
     flow, read = model_at(equations, integrator, course, calibrated, coefficients)
     force, initial = MissingForce(intensity, soft, int(equations.hidden)), Gaussian(x, spread)
-    model = StateSpaceModel(flow, _Scaled(read), force, _RowNoise(noise**2), initial)
+    model = StateSpaceModel(_Carried(flow), _Scaled(read), force, _RowNoise(noise**2), initial)
     n = readings.shape[0]
-    spans = jax.tree.map(lambda leaf: leaf[: n - 1], course.spans)
+    spans = jax.tree.map(lambda leaf: leaf[: n - 1], (course.spans, exposure))
     contexts = ((course.times[:n], course.inputs[:n]), roots)
     return model, spans, contexts, unscented_filter(model, readings * roots, spans, contexts)
 
@@ -97,6 +109,11 @@ def padded(values: Float[np.ndarray, "time ..."], length: int, fill: float) -> F
     return np.pad(values, lack, constant_values=fill)[:length]
 
 
+def exposure(exposures: Sequence[np.ndarray] | None, r: int, length: int) -> Float[np.ndarray, " length"]:
+    """Share of each span of a recording in which the missing force acts, up to `length`: none after those given."""
+    return np.ones(length) if exposures is None else padded(exposures[r], length, 0.0)
+
+
 def softness(problem: Problem, course: Course, z: np.ndarray, recording: int) -> np.ndarray:
     """d2H/dp_i2 at the initial phase point, by which a missing impulse becomes a missing velocity."""
     eq = problem.equations
@@ -116,9 +133,11 @@ def run_filter(
     intensity: Float[np.ndarray, " d"],
     spread: Float[np.ndarray, "state state"],
     readings: Float[np.ndarray, "row channel"],
+    exposures: Sequence[np.ndarray] | None = None,
 ) -> tuple[Any, Filtered]:
     """Filter a recording from the phase point in `z` with covariance `spread`; also returns what the filter was given.
 
+    `exposures` holds the share of each span in which the missing force acts, by recording; None where it always does.
     Readings after those of the leading rows that are given are hidden; rows beyond the recording's own are padding.
     """
     length = course.times.shape[0]
@@ -132,6 +151,7 @@ def run_filter(
         jax.device_put(found),
         jax.device_put(noise),
         jax.device_put(intensity),
+        jax.device_put(exposure(exposures, recording, length)),
         jax.device_put(softness(problem, course, z, recording)),
         jax.device_put(z[recording * problem.state : (recording + 1) * problem.state]),
         jax.device_put(spread),

@@ -22,6 +22,7 @@ _REMAINDERS = {
     "positional": "an error of the sensor that goes with what it reads",
     "static": "a small force that goes with place",
     "force": "a small missing force",
+    "spell": "a missing force for a while",
 }
 
 

@@ -33,7 +33,8 @@ class Estimate:
 
     `kind` is `white` (no remainder), `coloured` (an error of the sensor with a memory), `clock` (one of its clock
     beside that), `positional` (one that goes with what is read), `static` (a small force that goes with a
-    coordinate) or `force` (a white missing force of `intensity`).
+    coordinate), `force` (a white missing force of `intensity`) or `spell` (one that acts for a while: in the share
+    `exposures` of each span, by recording).
     `noise` is the white sd of one original reading, `bent` the variance of a positional error against its square,
     `bends` that error itself.
     """
@@ -47,6 +48,7 @@ class Estimate:
     converged: bool
     inflation: float = 1.0
     intensity: Float[np.ndarray, " d"] | None = None
+    exposures: tuple[np.ndarray, ...] | None = field(default=None, repr=False)
     paths: list[np.ndarray] | None = field(default=None, repr=False)
     colours: tuple[Colour, ...] = ()
     bent: tuple[float, ...] = ()

@@ -234,10 +234,10 @@ class Weigher:
         self.stepper, self.base = clean, base
 
     def add_paths(self, fits: Sequence[PathFit]) -> None:
-        """Of the intensities tried for each combination, the best, owing for the choice."""
+        """Of the intensities and spells tried for each combination, the best, owing for the choice."""
         for combination in dict.fromkeys(fit.combination for fit in fits):
             mine = [fit for fit in fits if fit.combination == combination]
-            values = np.array([fit.log_evidence + self._granted(fit) for fit in mine])
+            values = np.array([fit.log_evidence + self._granted(fit) - fit.choices for fit in mine])
             if not np.isfinite(values).any():
                 continue
             best = mine[int(np.argmax(values))]
@@ -247,13 +247,14 @@ class Weigher:
             self.found.add(
                 Estimate(
                     combination,
-                    "force",
+                    "force" if best.exposures is None else "spell",
                     best.z,
                     best.laplace.covariance,
                     best.noise,
                     float(mean) + self._owed_beside(combination),
                     best.converged,
                     intensity=best.intensity,
+                    exposures=best.exposures,
                     paths=best.paths,
                     outliers=white.outliers if white else (),
                 )  # fmt: skip

@@ -1,0 +1,116 @@
+"""A force that acts for a while and that no word says is told as such: when it acted, and no blow in its place."""
+
+from dataclasses import replace
+
+import engine_cases as cases
+import numpy as np
+import pytest
+
+from symplearn.diagnosis import Options, diagnose
+from symplearn.diagnosis._found import Found
+from symplearn.diagnosis._noisy import PathFit, fit_paths
+from symplearn.diagnosis._spells import spells
+from symplearn.diagnosis._start import priors_without_effects
+from symplearn.diagnosis._trajectory import Stepper
+from symplearn.diagnosis._weigher import Weigher
+
+TIMES = np.linspace(0.0, 20.0, 121)
+ON, OFF, PUSH = 8.3, 10.6, 0.15
+PENDULUM = cases.simulation("p**2/2 - g*cos(q)", more="[parameters]\ng = 1.0\n[recording.noise]\ny = 0.01")
+
+
+def pushed(seed, push=PUSH, times=TIMES):
+    """A pendulum that a constant force pushes from ON to OFF, by SciPy from one to the other."""
+    x, parts = [1.0, 0.0], []
+    for begin, end, force in ((times[0], ON, 0.0), (ON, OFF, push), (OFF, times[-1], 0.0)):
+        inner = times[(times >= begin) & (times < end)] if end < times[-1] else times[times >= begin]
+        asked = np.unique(np.concatenate([[begin], inner, [end]]))
+        found = cases.solved(lambda t, x, f=force: [x[1], -np.sin(x[0]) + f], x, asked)
+        parts.append(found[np.isin(asked, inner), 0])
+        x = found[-1]
+    noise = 0.01 * np.random.default_rng(seed).normal(size=len(times))
+    return cases.recorded(times, np.concatenate(parts) + noise)
+
+
+def calm(seed):
+    """The same, left alone."""
+    x = cases.solved(lambda t, x: [x[1], -np.sin(x[0])], [0.8, 0.1], TIMES[:80])[:, 0]
+    return cases.recorded(TIMES[:80], x + 0.01 * np.random.default_rng(seed).normal(size=80), number=2)
+
+
+@pytest.fixture(scope="module")
+def weighed():
+    """The pendulum as simulated, on a recording with the push and on one without, beside forces always at work and
+    for a while."""
+    p = cases.problem(PENDULUM, [pushed(0), calm(1)], 0.1)
+    stepper, priors = Stepper(p), priors_without_effects(p)
+    weigher = Weigher(stepper, Found(p, priors))
+    z, rows = np.zeros(p.size), weigher.rows
+    for r, x in enumerate(([1.0, 0.0], [0.8, 0.1])):
+        z[r * p.state : (r + 1) * p.state][[0, p.state // 2]] = x
+    paths = [np.tile(z[r * p.state : (r + 1) * p.state], (n, 1)) for r, n in enumerate(rows)]
+    always = [PathFit((), np.array([q]), z, np.array([0.01]), paths) for q in (1e-4, 1e-3, 1e-2)]
+    weigher.add_paths(fit_paths(stepper, always, priors, rows, 20))
+    starts = spells(stepper, weigher.found.of((), "force"), np.array([0.7]), rows)
+    weigher.add_paths(fit_paths(stepper, starts, priors, rows, 20))
+    return weigher, starts
+
+
+def test_it_is_looked_for_where_the_recording_is_strained(weighed):
+    """For every length the stretch overlaps the push, in the recording that has it, and the other has none."""
+    for start in weighed[1]:
+        acting, other = start.exposures
+        assert not other.any()
+        spans = np.flatnonzero(acting)
+        assert np.array_equal(spans, np.arange(spans[0], spans[-1] + 1))
+        assert TIMES[spans[0]] < OFF and TIMES[spans[-1] + 1] > ON
+
+
+def test_its_evidence_pays_for_when_it_acts(weighed):
+    """The evidence is the mean over lengths and strengths, each less the log of how many places it was chosen from; it
+    is far ahead of a force that is always at work."""
+    weigher, starts = weighed
+    fits = fit_paths(weigher.stepper, starts, weigher.found.priors, weigher.rows, 20)
+    spans = sum(n - 1 for n in weigher.rows)
+    values = [one.log_evidence + weigher._granted(one) - np.log(2 * spans / one.exposures[0].sum()) for one in fits]
+    spell = weigher.found.of((), "spell")
+    assert spell.log_evidence == pytest.approx(np.logaddexp.reduce(values) - np.log(len(values)), abs=1e-6)
+    assert spell.log_evidence > weigher.found.of((), "force").log_evidence + 10.0
+    # What is chosen covers most of the push and is not much longer.
+    times = TIMES[np.flatnonzero(spell.exposures[0])]
+    assert min(times[-1], OFF) - max(times[0], ON) > 0.7 * (OFF - ON) and times[-1] - times[0] < 3 * (OFF - ON)
+
+
+def test_a_calm_recording_gains_nothing_by_it(weighed):
+    """Where nothing pushes, a force for a while is no likelier than one that is always at work and very weak."""
+    p = cases.problem(PENDULUM, [calm(3)], 0.1)
+    stepper, priors = Stepper(p), priors_without_effects(p)
+    weigher = Weigher(stepper, Found(p, priors))
+    z = np.zeros(p.size)
+    z[[0, p.state // 2]] = [0.8, 0.1]
+    first = PathFit((), np.array([1e-10]), z, np.array([0.01]), [np.tile(z[: p.state], (80, 1))])
+    weigher.add_paths(fit_paths(stepper, [first, replace(first, intensity=np.array([1e-9]))], priors, [80], 20))
+    quiet = weigher.found.of((), "force")
+    weigher.add_paths(fit_paths(stepper, spells(stepper, quiet, np.array([0.7]), [80]), priors, [80], 20))
+    assert weigher.found.of((), "spell").log_evidence < quiet.log_evidence
+
+
+@pytest.mark.slow
+def test_a_push_is_no_blow():
+    """Through the verb, with the whole vocabulary: unexplained, when it acted, and what is held out is met."""
+    found = diagnose(PENDULUM, [pushed(0)], Options(jobs=2)).document
+    assert found["verdict"] == "unexplained" and found["probability"] > 0.9
+    ((begin, end),) = found["location"]["time_windows"]
+    assert found["location"]["targets"] == ["q"] and "for a while" in found["location"]["where"]
+    assert min(end, OFF) - max(begin, ON) > 0.7 * (OFF - ON) and end - begin < 3 * (OFF - ON)
+
+
+@pytest.mark.slow
+def test_a_blow_is_no_push():
+    """As much momentum at once is a blow for certain, whatever stands beside it."""
+    x = cases.struck(lambda t, x: [x[1], -np.sin(x[0])], [1.0, 0.0], TIMES, [0.0, PUSH * (OFF - ON)], ON)
+    readings = x[:, 0] + 0.01 * np.random.default_rng(0).normal(size=len(TIMES))
+    found = diagnose(PENDULUM, [cases.recorded(TIMES, readings)], Options(jobs=2)).document
+    blow = next(f for f in found["findings"] if f["effect"] == "impulse")
+    assert blow["probability"] > 0.9 and blow["coefficients"]["t_star"]["mean"] == pytest.approx(ON, abs=0.1)
+    assert all(one["probability"] < 0.1 for one in found["alternatives"] if one["unexplained"])
