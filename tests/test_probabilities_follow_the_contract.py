@@ -233,14 +233,14 @@ def test_beside_a_finding_a_remainder_has_a_quarter(problem):
     assert p.named[0].best.kind == "coloured"
 
 
-@pytest.mark.parametrize("holds", [True, False])
+@pytest.mark.parametrize("holds", [True, False, None])
 def test_findings_that_explain_less_than_they_leave_must_go_on_ahead(problem, holds):
     """Of an effect that gains 2 nats beside a coloured error that gains 3, that part counts as unexplained where the
-    fit does not go on ahead; beside remainders that gain less it is the effect all the same."""
+    fit does not go on ahead, or was not tried; beside remainders that gain less it is the effect all the same."""
     one, nothing = (place(problem, "viscous_damping", "q1"),), [estimate(problem, (), 0.0, kind) for kind in KINDS]
     values = {"white": 2.0, "coloured": 5.0, "clock": 3.0}
     kept = found(problem, *nothing, *(estimate(problem, one, value, kind) for kind, value in values.items()))
-    kept.ahead = {(): Ahead(0.0, True), one: Ahead(0.0, holds)}
+    kept.ahead = {(): Ahead(0.0, True)} if holds is None else {(): Ahead(0.0, True), one: Ahead(0.0, holds)}
     p = posterior(problem, kept, 1.0)
     small, large = 3 / 4 * np.exp(2.0) + 1 / 4 / 6 * np.exp(3.0), 1 / FAMILIES / 6 * np.exp(5.0)
     mine, rest = (small + large, 0.0) if holds else (small, large)

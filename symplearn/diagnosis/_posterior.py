@@ -77,8 +77,8 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
         total = evidences[combination] = float(np.logaddexp.reduce([plain + np.log(1.0 - _BESIDE), small, large]))
         if any(e.converged for e in estimates) and _informed(problem, found, combination):
             price = found.prices.log(combination)
-            # What explains less than is left beside it, and does not go on ahead, is not what was left out.
-            if combination in found.ahead and not found.ahead[combination].holds:
+            # What explains less than is left beside it, and was not seen to go on ahead, is not what was left out.
+            if found.ahead and not (combination in found.ahead and found.ahead[combination].holds):
                 other = float(np.logaddexp(other, price + large))
                 total = float(np.logaddexp(plain + np.log(1.0 - _BESIDE), small))
             named.append((combination, price, total, speaker(estimates)))
