@@ -240,6 +240,7 @@ SYSTEMS: dict[str, Callable[[], System]] = {
     "henon_heiles_order4_log": lambda: _henon_heiles("order4_step_5_times_larger", LOGARITHM),
     "cherry": lambda: _cherry(PUBLISHED),
     "cherry_log": lambda: _cherry(LOGARITHM),
+    "cherry_none": lambda: _cherry(NONE),
     "pendulum_flat": lambda: _pendulum(Flat(), PUBLISHED),
     "pendulum_laplace_0.1": lambda: _pendulum(Laplace(0.1), PUBLISHED),
     "pendulum_flat_log": lambda: _pendulum(Flat(), LOGARITHM),

@@ -41,6 +41,7 @@ REPEATS = {
     "henon_heiles_order4_log": (0, 20),
     "cherry": (0, 100),
     "cherry_log": (0, 100),
+    "cherry_none": (0, 100),
     "pendulum_flat": (10, 100),
     "pendulum_laplace_0.1": (0, 100),
     "pendulum_flat_log": (10, 100),

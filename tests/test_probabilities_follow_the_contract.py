@@ -233,19 +233,25 @@ def test_beside_a_finding_a_remainder_has_a_quarter(problem):
     assert p.named[0].best.kind == "coloured"
 
 
-@pytest.mark.parametrize("holds", [True, False, None])
-def test_findings_that_explain_less_than_they_leave_must_go_on_ahead(problem, holds):
+@pytest.mark.parametrize(
+    ("ahead", "counts"),
+    [(Ahead(0.0, True), True), (Ahead(-0.5, False), True), (Ahead(-1.5, False), False), (None, False)],
+)
+def test_findings_that_explain_less_than_they_leave_must_predict(problem, ahead, counts):
     """Of an effect that gains 2 nats beside a coloured error that gains 3, that part counts as unexplained where the
-    fit does not go on ahead, or was not tried; beside remainders that gain less it is the effect all the same."""
+    fit neither goes on ahead as it began nor predicts 2 nats better than nothing does, or was not tried; beside
+    remainders that gain less it is the effect all the same."""
     one, nothing = (place(problem, "viscous_damping", "q1"),), [estimate(problem, (), 0.0, kind) for kind in KINDS]
     values = {"white": 2.0, "coloured": 5.0, "clock": 3.0}
     kept = found(problem, *nothing, *(estimate(problem, one, value, kind) for kind, value in values.items()))
-    kept.ahead = {(): Ahead(0.0, True)} if holds is None else {(): Ahead(0.0, True), one: Ahead(0.0, holds)}
+    kept.ahead = {(): Ahead(-3.0, False)} | ({} if ahead is None else {one: ahead})
     p = posterior(problem, kept, 1.0)
     small, large = 3 / 4 * np.exp(2.0) + 1 / 4 / 6 * np.exp(3.0), 1 / FAMILIES / 6 * np.exp(5.0)
-    mine, rest = (small + large, 0.0) if holds else (small, large)
-    assert p.named[0].probability / p.as_it_is == pytest.approx(DAMPING * mine, rel=ROUND_OFF)
-    assert p.unexplained / p.as_it_is == pytest.approx(1 / FAMILIES + DAMPING * rest, rel=ROUND_OFF)
+    mine, rest = (small + large, 0.0) if counts else (small, large)
+    scored = np.exp(min((one.score for one in kept.ahead.values()) if ahead is None else [ahead.score]))
+    assert p.named[0].probability / p.as_it_is == pytest.approx(DAMPING * mine * scored / np.exp(-3.0), rel=1e-9)
+    alone = np.mean([*[1.0] * 5, np.exp(3.0)]) / FAMILIES  # a spell has no score
+    assert p.unexplained / p.as_it_is == pytest.approx(alone + DAMPING * rest * scored / np.exp(-3.0), rel=1e-9)
 
 
 def test_how_a_trajectory_goes_on_says_nothing_of_a_spell(problem):

@@ -109,7 +109,8 @@ def _filtered(stepper: Stepper, e: Estimate, zs: Array, key: Array) -> Array:
     """Draws of the phase point at the last row under a missing force, each filtered through all rows."""
     problem, course = stepper.problem, stepper.courses[0]
     length = course.times.shape[0]
-    fixed = (total_noise(e), intensity_of(stepper, e), exposure(e.exposures, 0, length), softness(problem, course, e.z, 0), start_spread(stepper, e, 0),
+    fixed = (total_noise(e), intensity_of(stepper, e), exposure(e.exposures, 0, length),
+             softness(problem, course, e.z, 0), start_spread(stepper, e, 0),
              padded(problem.rows[0].readings, length, np.nan), row_roots(problem, 0, length, colour_ratio(e)),
              problem.onehot(e.combination, 0))  # fmt: skip
     keys = jax.random.split(key, len(zs))

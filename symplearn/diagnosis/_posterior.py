@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._effects import HIDDEN, Oscillating
-from ._found import Found, speaker
+from ._found import Ahead, Found, speaker
 from ._problem import Combination, Problem
 from ._strength import faint_share
 from ._weighed import Estimate
@@ -18,6 +18,8 @@ _UNINFORMED = 0.7
 CONSISTENT = 0.05
 # Prior share of a remainder beside findings: as many cases as issue 6 would have carry one.
 _BESIDE = 0.25
+# Nats by which a combination must predict ahead better than nothing, to count beside a remainder larger than itself.
+_BETTER = 2.0
 # Kinds of remainder other than white noise, which divide its prior among them.
 _REMAINDERS = ("coloured", "clock", "positional", "static", "force", "spell")
 
@@ -65,11 +67,9 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     evidences: dict[Combination, float] = {}
     for combination, estimates in found.estimates.items():
         tempered = {e.kind: top + factor * (e.log_evidence - top) for e in estimates}
-        # How a trajectory goes on says nothing of a force that acts for a while.
         ahead = found.ahead[combination].score if combination in found.ahead else unseen
-        tempered = {kind: value + ahead * (kind != "spell") for kind, value in tempered.items()}
-        plain = tempered.get("white", -np.inf)
-        small, large = _beside_a_remainder(tempered, least if combination else np.inf, remainder)
+        plain = tempered.get("white", -np.inf) + ahead
+        small, large = _beside_a_remainder(tempered, least if combination else np.inf, remainder, ahead)
         if not combination:
             white, other = plain, float(np.logaddexp(other, large))
             evidences[combination] = max(plain, large - np.log(remainder))
@@ -77,8 +77,8 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
         total = evidences[combination] = float(np.logaddexp.reduce([plain + np.log(1.0 - _BESIDE), small, large]))
         if any(e.converged for e in estimates) and _informed(problem, found, combination):
             price = found.prices.log(combination)
-            # What explains less than is left beside it, and was not seen to go on ahead, is not what was left out.
-            if found.ahead and not (combination in found.ahead and found.ahead[combination].holds):
+            # What explains less than it leaves, and was not seen to predict anything, is not what was left out.
+            if found.ahead and not _predicts(found, combination):
                 other = float(np.logaddexp(other, price + large))
                 total = float(np.logaddexp(plain + np.log(1.0 - _BESIDE), small))
             named.append((combination, price, total, speaker(estimates)))
@@ -99,10 +99,16 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     )
 
 
+def _predicts(found: Found, combination: Combination) -> bool:
+    """Whether a trajectory goes on as it began, or at least better than that of the simulation as it is."""
+    mine, nothing = found.ahead.get(combination), found.ahead.get((), Ahead(0.0, False))
+    return mine is not None and (mine.holds or mine.score > nothing.score + _BETTER)
+
+
 @np.errstate(invalid="ignore")  # where neither has an evidence, which gains more does not matter
-def _beside_a_remainder(tempered: Mapping[str, float], least: float, price: float) -> tuple[float, float]:
+def _beside_a_remainder(tempered: Mapping[str, float], least: float, price: float, ahead: float) -> tuple[float, float]:
     """Log evidence of a combination beside a small remainder, and beside a large one, prior of the remainder included;
-    `least` is that of nothing.
+    `least` is that of nothing, `ahead` what is added for how a trajectory goes on, which says nothing of a spell.
 
     Real systems often keep a small one. But one that gains more than the findings do is not small beside them: it has
     the contract's price of what has no name, as it has without findings.
@@ -110,6 +116,7 @@ def _beside_a_remainder(tempered: Mapping[str, float], least: float, price: floa
     white = tempered.get("white", -np.inf)
     values = np.array([tempered.get(kind, -np.inf) for kind in _REMAINDERS])
     small = white - least >= values - white
+    values += np.where(np.array(_REMAINDERS) == "spell", 0.0, ahead)
     parts = np.where(small, values + np.log(_BESIDE), -np.inf), np.where(small, -np.inf, values + np.log(price))
     return _mixture(parts[0]), _mixture(parts[1])
 

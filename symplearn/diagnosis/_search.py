@@ -382,9 +382,9 @@ class Search:
     def _weigh_spells(self) -> None:
         """Nothing, and the very best, beside a missing force that acts for a while; not where nothing is left out."""
         w, best = self.weigher, max(self.found.estimates, key=self.found.odds)
-        white = self.found.of(self.base, "white")
-        lead = np.inf if white is None else self.found.odds(best) - self.found.prices.log(self.base) - white.log_evidence
-        if lead < _WORTH or not self._in_time():  # nothing is left out
+        white, price = self.found.of(self.base, "white"), self.found.prices.log(self.base)
+        is_all = white is not None and self.found.odds(best) < white.log_evidence + price + _WORTH
+        if is_all or not self._in_time():
             return
         pulls = [pull for c in dict.fromkeys([self.base, best]) if (pull := self.found.of(c, "force"))]
         starts = [start for pull in pulls for start in spells(w.stepper, pull, self.typical, self.rows)]

@@ -1,6 +1,7 @@
 """A missing force that acts for a while and not before or after: where it may have acted, and paths under it."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -16,9 +17,7 @@ _LENGTHS, _STRENGTHS = (1 / 16, 1 / 8, 1 / 4, 1 / 2), np.geomspace(1e-3, 1.0, 4)
 _OVERLAP = 2
 
 
-def spells(
-    stepper: Stepper, pull: Estimate, typical: Float[np.ndarray, " d"], rows: Sequence[int]
-) -> list[PathFit]:
+def spells(stepper: Stepper, pull: Estimate, typical: Float[np.ndarray, " d"], rows: Sequence[int]) -> list[PathFit]:
     """Where fits of a combination beside a force that acts for a while begin: for every length of it where `pull`, a
     force that always acts, is strained most."""
     assert pull.intensity is not None and pull.paths is not None  # it is an estimate beside a force
@@ -34,11 +33,11 @@ def spells(
         times = stepper.problem.rows[r].times
         length = times[min(begin + width, len(times) - 1)] - times[begin]
         choices = float(np.log(sum(max(1.0, _OVERLAP * len(each) / width) for each in strain)))
-        out += [
-            PathFit(pull.combination, (share * np.maximum(typical, 1e-300)) ** 2 * length, pull.z, pull.noise, pull.paths,
-                    exposures=exposures, choices=choices)
-            for share in _STRENGTHS
-        ]  # fmt: skip
+        first = PathFit(
+            pull.combination, pull.intensity, pull.z, pull.noise, pull.paths, exposures=exposures, choices=choices
+        )
+        forces = [share * np.maximum(typical, 1e-300) for share in _STRENGTHS]
+        out += [replace(first, intensity=force**2 * length) for force in forces]
     return out
 
 

@@ -68,8 +68,9 @@ class _Scaled(eqx.Module):
 
 
 def filter_lane(
-    equations, integrator, course, calibrated, coefficients, noise, intensity, exposure, soft, x, spread, readings, roots
-) -> tuple[StateSpaceModel, Any, Any, Filtered]:
+    equations, integrator, course, calibrated, coefficients, noise, intensity, exposure, soft, x, spread, readings,
+    roots,
+) -> tuple[StateSpaceModel, Any, Any, Filtered]:  # fmt: skip
     """Filter the leading rows that `readings` covers from N(x, spread); also the model and what it was given.
 
     `noise` is that of one original reading; `roots` (time, channel) the root of each row's information in its units;
