@@ -18,8 +18,6 @@ _UNINFORMED = 0.7
 CONSISTENT = 0.05
 # Prior share of a remainder beside findings: as many cases as issue 6 would have carry one.
 _BESIDE = 0.25
-# Nats by which a combination must predict ahead better than nothing, to count beside a remainder larger than itself.
-_BETTER = 2.0
 # Kinds of remainder other than white noise, which divide its prior among them.
 _REMAINDERS = ("coloured", "clock", "positional", "static", "force", "spell")
 
@@ -78,7 +76,7 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
         if any(e.converged for e in estimates) and _informed(problem, found, combination):
             price = found.prices.log(combination)
             # What explains less than it leaves, and was not seen to predict anything, is not what was left out.
-            if found.ahead and not _predicts(found, combination):
+            if found.ahead and not _predicts(found.ahead.get(combination)):
                 other = float(np.logaddexp(other, price + large))
                 total = float(np.logaddexp(plain + np.log(1.0 - _BESIDE), small))
             named.append((combination, price, total, speaker(estimates)))
@@ -99,10 +97,9 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     )
 
 
-def _predicts(found: Found, combination: Combination) -> bool:
+def _predicts(one: Ahead | None) -> bool:
     """Whether a trajectory goes on as it began, or at least better than that of the simulation as it is."""
-    mine, nothing = found.ahead.get(combination), found.ahead.get((), Ahead(0.0, False))
-    return mine is not None and (mine.holds or mine.score > nothing.score + _BETTER)
+    return one is not None and (one.holds or one.is_better)
 
 
 @np.errstate(invalid="ignore")  # where neither has an evidence, which gains more does not matter
