@@ -25,8 +25,8 @@ _FLATTEST = 1e-12
 
 @dataclass(frozen=True)
 class Ahead:
-    """How a combination predicts rows that a trajectory fit has not seen: a score in nats, at most zero, whether it errs
-    there hardly more than where it was fitted, and whether clearly less than the simulation as it is."""
+    """How a combination predicts rows that a trajectory fit has not seen: a score in nats, at most zero, whether it
+    errs there hardly more than where it was fitted, and whether clearly less than the simulation as it is."""
 
     score: float
     holds: bool
