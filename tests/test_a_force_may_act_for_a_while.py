@@ -19,13 +19,13 @@ ON, OFF, PUSH = 8.3, 10.6, 0.15
 PENDULUM = cases.simulation("p**2/2 - g*cos(q)", more="[parameters]\ng = 1.0\n[recording.noise]\ny = 0.01")
 
 
-def pushed(seed, push=PUSH, times=TIMES):
-    """A pendulum that a constant force pushes from ON to OFF, by SciPy from one to the other."""
+def pushed(seed, drag=0.0, push=PUSH, times=TIMES):
+    """A pendulum that a constant force pushes from ON to OFF, by SciPy from one to the other; with a viscous drag."""
     x, parts = [1.0, 0.0], []
     for begin, end, force in ((times[0], ON, 0.0), (ON, OFF, push), (OFF, times[-1], 0.0)):
         inner = times[(times >= begin) & (times < end)] if end < times[-1] else times[times >= begin]
         asked = np.unique(np.concatenate([[begin], inner, [end]]))
-        found = cases.solved(lambda t, x, f=force: [x[1], -np.sin(x[0]) + f], x, asked)
+        found = cases.solved(lambda t, x, f=force: [x[1], -np.sin(x[0]) - drag * x[1] + f], x, asked)
         parts.append(found[np.isin(asked, inner), 0])
         x = found[-1]
     noise = 0.01 * np.random.default_rng(seed).normal(size=len(times))
@@ -102,6 +102,19 @@ def test_a_push_is_no_blow():
     assert found["verdict"] == "unexplained" and found["probability"] > 0.9
     ((begin, end),) = found["location"]["time_windows"]
     assert found["location"]["targets"] == ["q"] and "for a while" in found["location"]["where"]
+    assert min(end, OFF) - max(begin, ON) > 0.7 * (OFF - ON) and end - begin < 3 * (OFF - ON)
+
+
+@pytest.mark.slow
+def test_a_push_may_be_left_beside_a_drag():
+    """A drag all the time and a push for a while: dissipation is certain, though its law is open, and when the push
+    acted is told as what is left beside it."""
+    found = diagnose(PENDULUM, [pushed(0, drag=0.03)], Options(jobs=2)).document
+    assert found["family_probability"]["dissipation"] > 0.99 and len(found["findings"]) == 1
+    laws = [found["findings"][0], *(one["findings"][0] for one in found["alternatives"] if one["findings"])]
+    assert "viscous_damping" in [law["effect"] for law in laws[:2]]
+    (told,) = [one for one in found["warnings"] if "for a while" in one]
+    begin, end = (float(part) for part in told.split("t = ")[1].split(" to "))
     assert min(end, OFF) - max(begin, ON) > 0.7 * (OFF - ON) and end - begin < 3 * (OFF - ON)
 
 

@@ -17,7 +17,7 @@ from ._problem import MOST, Combination, Problem
 from ._prospects import MANY, Prospects, promising
 from ._refinement import Refinement
 from ._score import Start
-from ._spells import spells
+from ._spells import Spells
 from ._start import priors_without_effects, with_states
 from ._stochastic import free_run
 from ._trajectory import LANES, Stepper
@@ -380,15 +380,12 @@ class Search:
             self._add_forces(named[1 : KEPT // 2 if self.weigher.is_long else _FORCED], 2)
 
     def _weigh_spells(self) -> None:
-        """Nothing, and the very best, beside a missing force that acts for a while; not where nothing is left out."""
-        w, best = self.weigher, max(self.found.estimates, key=self.found.odds)
-        white, price = self.found.of(self.base, "white"), self.found.prices.log(self.base)
-        is_all = white is not None and self.found.odds(best) < white.log_evidence + price + _WORTH
-        if is_all or not self._in_time():
-            return
-        pulls = [pull for c in dict.fromkeys([self.base, best]) if (pull := self.found.of(c, "force"))]
-        starts = [start for pull in pulls for start in spells(w.stepper, pull, self.typical, self.rows)]
-        w.add_paths(fit_paths(w.stepper, starts, self.found.priors, self.rows, w.path_steps))
+        """Forces that act for a while, where something was left out."""
+        best, white = max(self.found.estimates, key=self.found.odds), self.found.of(self.base, "white")
+        alone = -np.inf if white is None else white.log_evidence + self.found.prices.log(self.base)
+        if self.found.odds(best) > alone + _WORTH and self._in_time():
+            self.progress("weighing forces that act for a while")
+            Spells(self.prospects, self.typical).weigh(best, _REACH)
 
     def _add_forces(self, combinations: Sequence[Combination], every: int) -> None:
         starts = []

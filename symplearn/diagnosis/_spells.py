@@ -6,8 +6,11 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from ._noisy import PathFit
+from ._noisy import PathFit, fit_paths
 from ._outlook import Outlook
+from ._problem import Combination
+from ._prospects import Prospects
+from ._score import Start
 from ._trajectory import Stepper
 from ._weighed import Estimate
 
@@ -15,6 +18,51 @@ from ._weighed import Estimate
 _LENGTHS, _STRENGTHS = (1 / 16, 1 / 8, 1 / 4, 1 / 2), np.geomspace(1e-3, 1.0, 4)
 # Places of a spell that are told apart, per length of it.
 _OVERLAP = 2
+# Single effects that are tried beside a spell, those whose own spells are looked for, places at which an effect is
+# tried, and nats that one must promise.
+_TRIED, _OWN, _PLACES, _WORTH = 4, 2, 60, 2.0
+
+
+class Spells:
+    """Weighs forces that act for a while: beside nothing, beside the best combination, and, where nothing with one is
+    near the best, beside the single effects that promise most along its path."""
+
+    def __init__(self, prospects: Prospects, typical: Float[np.ndarray, " d"]):
+        self.prospects, self.typical = prospects, typical
+        self.weigher = prospects.weigher
+
+    def weigh(self, best: Combination, reach: float) -> None:
+        """Add what was found; `reach` is how many nats nothing may lie behind the best of all for more to be tried."""
+        w = self.weigher
+        pulls = [pull for c in dict.fromkeys([w.base, best]) if (pull := w.found.of(c, "force"))]
+        fits = self._add([start for pull in pulls for start in self._about(pull)])
+        alone = [fit for fit in fits if fit.combination == w.base and np.isfinite(fit.log_evidence)]
+        if not alone or w.found.odds(w.base) < w.found.odds(best) - reach:
+            return
+        path = max(alone, key=lambda fit: fit.log_evidence - fit.choices)
+        chosen = replace(path, laplace=None, choices=path.choices + float(np.log(len(alone))))
+        likely = self._promising(path)
+        self._add([replace(chosen, combination=one.combination, z=one.z) for one in likely])
+        ranked = [one.combination for one in likely if w.found.of(one.combination, "spell")]
+        ranked.sort(key=w.found.odds, reverse=True)
+        self._add([start for c in ranked[:_OWN] if (own := w.found.of(c, "spell")) for start in self._about(own)])
+
+    def _about(self, pull: Estimate) -> list[PathFit]:
+        return spells(self.weigher.stepper, pull, self.typical, self.weigher.rows)
+
+    def _add(self, starts: list[PathFit]) -> list[PathFit]:
+        w = self.weigher
+        fits = fit_paths(w.stepper, starts, w.found.priors, w.rows, w.path_steps)
+        w.add_paths(fits)
+        return fits
+
+    def _promising(self, path: PathFit) -> list[Start]:
+        """Single effects, each at its best place, that promise most along a path under a spell."""
+        promised = sorted(self.prospects.along(path, _PLACES), key=lambda start: start.gain)
+        # Every combination that is weighed at all is weighed under white noise.
+        likely = {one.combination: one for one in promised if self.weigher.found.of(one.combination, "white")}
+        ranked = sorted(likely.values(), key=lambda start: -start.gain)[:_TRIED]
+        return [one for one in ranked if one.gain > _WORTH]
 
 
 def spells(stepper: Stepper, pull: Estimate, typical: Float[np.ndarray, " d"], rows: Sequence[int]) -> list[PathFit]:

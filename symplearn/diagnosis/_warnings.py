@@ -6,6 +6,7 @@ import numpy as np
 
 from .._recording import Recording
 from ._found import Found
+from ._locate import spell_windows
 from ._outlook import Outlook
 from ._posterior import Posterior, Weighed
 from ._problem import Problem
@@ -63,7 +64,8 @@ def warnings(
         if moved > 3:
             out.append(f"{name} moved {moved:.1f} of its prior standard deviations to fit the recording")
     if chosen is not None and chosen.best.kind != "white":
-        out.append(f"a remainder without a name is left beside the findings: {_REMAINDERS[chosen.best.kind]}")
+        when = _when(problem, recordings, chosen.best)
+        out.append(f"a remainder without a name is left beside the findings: {_REMAINDERS[chosen.best.kind]}{when}")
     if chosen is not None and any(o.estimate.bends for o in with_):
         out.append("what is known of that error is part of the readings that are expected with the findings; "
                    "augmented.toml does not have it")  # fmt: skip
@@ -74,6 +76,13 @@ def warnings(
         out.append(f"evidence was discounted by a factor of {1 / odds.tempered:.1f}: "
                    "the remainder is not white on the scale of the motion")  # fmt: skip
     return out
+
+
+def _when(problem: Problem, recordings: Sequence[Recording], best: Estimate) -> str:
+    """From when to when a remainder acts that does not always."""
+    acts = spell_windows(problem, best.exposures) if best.exposures is not None else []
+    where = [f" in recording {recordings[r].number}" if len(recordings) > 1 else "" for r, _ in acts]
+    return "".join(f", t = {w[0]:g} to {w[1]:g}{run}" for (_, w), run in zip(acts, where, strict=True))
 
 
 def far_off(forecast: Forecast, recording: Recording) -> list[str]:

@@ -261,11 +261,15 @@ class Weigher:
             )
 
     def _granted(self, fit: PathFit) -> float:
-        """What a path gains where noise may have heavier tails, and its effects be of any order of magnitude."""
+        """What a path gains where noise may have heavier tails, and its effects be of any order of magnitude.
+
+        Nothing of the former while it has not settled: errors after a step that a bound cut short are not those of its
+        evidence.
+        """
         if fit.laplace is None or fit.errors is None:
             return 0.0
         strength = strength_gain(self.problem, fit.combination, self.found.priors, fit.z, fit.laplace.covariance)
-        return strength + law_gain(self.problem, fit.combination, fit.errors)
+        return strength + (law_gain(self.problem, fit.combination, fit.errors) if fit.converged else 0.0)
 
     @property
     def is_long(self) -> bool:
