@@ -33,7 +33,7 @@ def fit(
     """Held-out error of the free run in the columns' units, its log density, and the noises.
 
     Free run and density are those of `outlooks`. `needed` holds the process noise and the reading noise that it takes
-    to follow the fitted rows. `inflation` multiplies the posterior covariance of the unknowns.
+    to follow the fitted rows, a force that acts for a while in the mean over them. `inflation` multiplies the posterior covariance of the unknowns.
     """
     columns, momenta = problem.equations.columns, problem.equations.momenta
     squares, numbers, density = np.zeros(len(columns)), np.zeros(len(columns)), 0.0
@@ -47,7 +47,8 @@ def fit(
     with np.errstate(invalid="ignore", divide="ignore"):
         rmse = np.sqrt(squares / numbers)
     held_out = any((r.times > o.rows.boundary).any() for o, r in zip(outlooks, recordings, strict=True))
-    intensity = np.zeros(len(momenta)) if needed.intensity is None else np.sqrt(needed.intensity)
+    exposed = 1.0 if needed.exposures is None else float(np.mean(np.concatenate(needed.exposures)))
+    intensity = np.zeros(len(momenta)) if needed.intensity is None else np.sqrt(needed.intensity * exposed)
     return {
         "holdout_rmse": {c: finite(x) for c, x in zip(columns, rmse, strict=True)} if held_out else None,
         "holdout_log_density": finite(density) if held_out else None,

@@ -67,18 +67,19 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
         tempered = {e.kind: top + factor * (e.log_evidence - top) for e in estimates}
         ahead = found.ahead[combination].score if combination in found.ahead else unseen
         plain = tempered.get("white", -np.inf) + ahead
-        small, large = _beside_a_remainder(tempered, least if combination else np.inf, remainder, ahead)
+        beside, doubtful = _beside_a_remainder(tempered, least if combination else np.inf, remainder, ahead)
+        noisy = float(np.logaddexp(beside, doubtful))
         if not combination:
-            white, other = plain, float(np.logaddexp(other, large))
-            evidences[combination] = max(plain, large - np.log(remainder))
+            white, other = plain, float(np.logaddexp(other, noisy))
+            evidences[combination] = max(plain, noisy - np.log(remainder))
             continue
-        total = evidences[combination] = float(np.logaddexp.reduce([plain + np.log(1.0 - _BESIDE), small, large]))
+        total = evidences[combination] = float(np.logaddexp(plain + np.log(1.0 - _BESIDE), noisy))
         if any(e.converged for e in estimates) and _informed(problem, found, combination):
             price = found.prices.log(combination)
             # What explains less than it leaves, and was not seen to predict anything, is not what was left out.
             if found.ahead and not _predicts(found.ahead.get(combination)):
-                other = float(np.logaddexp(other, price + large))
-                total = float(np.logaddexp(plain + np.log(1.0 - _BESIDE), small))
+                other = float(np.logaddexp(other, price + doubtful))
+                total = float(np.logaddexp(plain + np.log(1.0 - _BESIDE), beside))
             named.append((combination, price, total, speaker(estimates)))
     with np.errstate(divide="ignore"):
         faint = white + np.log(_unseen(problem, found))
@@ -104,18 +105,19 @@ def _predicts(one: Ahead | None) -> bool:
 
 @np.errstate(invalid="ignore")  # where neither has an evidence, which gains more does not matter
 def _beside_a_remainder(tempered: Mapping[str, float], least: float, price: float, ahead: float) -> tuple[float, float]:
-    """Log evidence of a combination beside a small remainder, and beside a large one, prior of the remainder included;
-    `least` is that of nothing, `ahead` what is added for how a trajectory goes on, which says nothing of a spell.
+    """Log evidence of a combination beside remainders, prior of these included: of those that it may be told beside, and
+    of the doubtful. `least` is the evidence of nothing, `ahead` what is added for how a trajectory goes on.
 
     Real systems often keep a small one. But one that gains more than the findings do is not small beside them: it has
-    the contract's price of what has no name, as it has without findings.
+    the contract's price of what has no name, as it has without findings, and they are doubtful. How a trajectory goes
+    on says nothing of a force that acts for a while.
     """
     white = tempered.get("white", -np.inf)
     values = np.array([tempered.get(kind, -np.inf) for kind in _REMAINDERS])
-    small = white - least >= values - white
-    values += np.where(np.array(_REMAINDERS) == "spell", 0.0, ahead)
-    parts = np.where(small, values + np.log(_BESIDE), -np.inf), np.where(small, -np.inf, values + np.log(price))
-    return _mixture(parts[0]), _mixture(parts[1])
+    small, lasts = white - least >= values - white, np.array(_REMAINDERS) != "spell"
+    logs = values + np.where(lasts, ahead, 0.0) + np.log(np.where(small, _BESIDE, price))
+    doubtful = ~small & lasts
+    return _mixture(np.where(doubtful, -np.inf, logs)), _mixture(np.where(doubtful, logs, -np.inf))
 
 
 def _unseen(problem: Problem, found: Found) -> float:
