@@ -268,6 +268,17 @@ def test_how_a_trajectory_goes_on_says_nothing_of_a_spell(problem):
     assert p.unexplained / p.as_it_is == pytest.approx(np.mean([*[1.0] * 5, np.exp(4.0)]) / FAMILIES, rel=1e-9)
 
 
+def test_beside_a_spell_a_finding_need_not_go_on(problem):
+    """An effect that gains 2 nats beside a force for a while that gains 30 keeps what it has there, whatever it predicts:
+    where the force acts no trajectory goes on."""
+    one, nothing = (place(problem, "viscous_damping", "q1"),), [estimate(problem, (), 0.0, kind) for kind in KINDS]
+    kept = found(problem, *nothing, estimate(problem, one, 2.0), estimate(problem, one, 32.0, "spell"))
+    kept.ahead = {(): Ahead(0.0, False, False), one: Ahead(0.0, False, False)}
+    p = posterior(problem, kept, 1.0)
+    expected = DAMPING * (3 / 4 * np.exp(2.0) + np.exp(32.0) / FAMILIES / 6)
+    assert p.named[0].probability / p.as_it_is == pytest.approx(expected, rel=1e-9)
+
+
 def test_what_the_recording_says_nothing_of_is_not_weighed(problem):
     """An effect whose posterior is as wide as its prior is left out, and so is a pair that holds one."""
     known, blind = place(problem, "viscous_damping", "q1"), place(problem, "linear_stiffness", "q2")

@@ -33,7 +33,8 @@ def fit(
     """Held-out error of the free run in the columns' units, its log density, and the noises.
 
     Free run and density are those of `outlooks`. `needed` holds the process noise and the reading noise that it takes
-    to follow the fitted rows, a force that acts for a while in the mean over them. `inflation` multiplies the posterior covariance of the unknowns.
+    to follow the fitted rows; a force that acts for a while counts in the mean over them. `inflation` multiplies the
+    posterior covariance of the unknowns.
     """
     columns, momenta = problem.equations.columns, problem.equations.momenta
     squares, numbers, density = np.zeros(len(columns)), np.zeros(len(columns)), 0.0

@@ -105,8 +105,8 @@ def _predicts(one: Ahead | None) -> bool:
 
 @np.errstate(invalid="ignore")  # where neither has an evidence, which gains more does not matter
 def _beside_a_remainder(tempered: Mapping[str, float], least: float, price: float, ahead: float) -> tuple[float, float]:
-    """Log evidence of a combination beside remainders, prior of these included: of those that it may be told beside, and
-    of the doubtful. `least` is the evidence of nothing, `ahead` what is added for how a trajectory goes on.
+    """Log evidence of a combination beside remainders, prior of these included: of those that it may be told beside,
+    and of the doubtful. `least` is the evidence of nothing, `ahead` what is added for how a trajectory goes on.
 
     Real systems often keep a small one. But one that gains more than the findings do is not small beside them: it has
     the contract's price of what has no name, as it has without findings, and they are doubtful. How a trajectory goes
