@@ -269,8 +269,8 @@ def test_how_a_trajectory_goes_on_says_nothing_of_a_spell(problem):
 
 
 def test_beside_a_spell_a_finding_need_not_go_on(problem):
-    """An effect that gains 2 nats beside a force for a while that gains 30 keeps what it has there, whatever it predicts:
-    where the force acts no trajectory goes on."""
+    """An effect that gains 2 nats beside a force for a while that gains 30 keeps what it has there, whatever it
+    predicts: where the force acts no trajectory goes on."""
     one, nothing = (place(problem, "viscous_damping", "q1"),), [estimate(problem, (), 0.0, kind) for kind in KINDS]
     kept = found(problem, *nothing, estimate(problem, one, 2.0), estimate(problem, one, 32.0, "spell"))
     kept.ahead = {(): Ahead(0.0, False, False), one: Ahead(0.0, False, False)}
