@@ -8,7 +8,9 @@ import pytest
 
 from symplearn.diagnosis import Options, diagnose
 from symplearn.diagnosis._found import Found
+from symplearn.diagnosis._locate import strained_when
 from symplearn.diagnosis._noisy import PathFit, fit_paths
+from symplearn.diagnosis._outlook import Outlook
 from symplearn.diagnosis._spells import spells
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
@@ -64,6 +66,16 @@ def test_it_is_looked_for_where_the_recording_is_strained(weighed):
         spans = np.flatnonzero(acting)
         assert np.array_equal(spans, np.arange(spans[0], spans[-1] + 1))
         assert TIMES[spans[0]] < OFF and TIMES[spans[-1] + 1] > ON
+
+
+def test_a_force_that_always_acts_tells_too_when_it_is_strained(weighed):
+    """What stands out is a part of the recording that has the push, about the push, and no part of the other."""
+    weigher, _ = weighed
+    pull = weigher.found.of((), "force")
+    outlooks = [Outlook(weigher.stepper, pull, r, pull.intensity) for r in range(2)]
+    (here, first), (there, second) = strained_when(outlooks, [0])
+    assert (first, second) == (1, 2) and there == [TIMES[0], TIMES[79]]
+    assert here[0] < OFF and here[1] > ON and here[1] - here[0] < 3 * (OFF - ON)
 
 
 def test_its_evidence_pays_for_when_it_acts(weighed):

@@ -22,7 +22,7 @@ from ._locate import (
     present_windows,
     spell_windows,
     strained_coordinates,
-    strained_windows,
+    strained_when,
     where_sentence,
     whole_windows,
 )
@@ -303,7 +303,7 @@ class Answer:
                 found = [(w, r + 1) for r, w in spell_windows(self.problem, self.before.exposures)]
             else:
                 where = where_sentence(self.problem, self.lens[0], strained[0])
-                found = [(w, o.recording + 1) for o in self.lens for w in strained_windows(o, strained[0])]
+                found = strained_when(self.lens, strained)
             windows = [[*w, r] if several else w for w, r in found]
         numbers = list(range(1, len(self.lens) + 1))
         return {"kind": kind, "targets": targets, "recordings": numbers, "time_windows": windows, "where": where}

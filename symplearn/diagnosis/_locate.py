@@ -11,8 +11,9 @@ from ._problem import Combination, Problem
 
 # Standardised disturbances are looked at in this many stretches of the recording.
 _STRETCHES = 24
-# A stretch stands out when its mean square is this far above one that holds nothing.
-_STANDS_OUT = 2.5
+# A stretch stands out when its mean square is this many times that of most, and nearly as large as the force's own
+# intensity would have it: where most of the recording is quiet that is fitted to what stands out.
+_STANDS_OUT, _STRONG = 2.5, 0.7
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def strained_windows(outlook: Outlook, coordinate: int) -> list[list[float]]:
     series = outlook.strain()[:, coordinate] ** 2
     edges = np.linspace(0, n, min(_STRETCHES, max(2, n // 8)) + 1).astype(int)
     level = np.array([series[a:b].mean() for a, b in zip(edges[:-1], edges[1:], strict=True)])
-    out = level > _STANDS_OUT * max(1.0, float(np.median(level)))
+    out = level > max(_STRONG, _STANDS_OUT * float(np.median(level)))
     if out.all() or not out.any():
         return whole
     windows: list[list[float]] = []
@@ -72,6 +73,14 @@ def strained_windows(outlook: Outlook, coordinate: int) -> list[list[float]]:
         else:
             windows.append([a, b])
     return windows
+
+
+def strained_when(outlooks: Sequence[Outlook], coordinates: Sequence[int]) -> list[tuple[list[float], int]]:
+    """When disturbances stand out, and in which recording: on the first of some coordinates on which they do so for a
+    part of the time only; else always."""
+    whole = [([float(o.rows.times[0]), float(o.rows.times[o.rows.fitted - 1])], o.recording + 1) for o in outlooks]
+    every = [[(w, o.recording + 1) for o in outlooks for w in strained_windows(o, i)] for i in coordinates]
+    return next((found for found in every if found != whole), whole)
 
 
 def spell_windows(problem: Problem, exposures: Sequence[np.ndarray]) -> list[tuple[int, list[float]]]:
