@@ -288,7 +288,8 @@ class Answer:
         return where_sentence(self.problem, self.lens[0], first)
 
     def _unexplained_location(self) -> dict[str, Any]:
-        eq, several = self.problem.equations, len(self.lens) > 1
+        eq, numbers = self.problem.equations, list(range(1, len(self.lens) + 1))
+        several = len(numbers) > 1
         # A nearly periodic remainder goes with the motion, so a force is likelier than an error of the sensor.
         remembered = all(colour.damping >= 1 for colour in (*self.before.colours, *self.before.clocks))
         if remembered and (way := _WAYS.get(self.before.kind)):
@@ -301,11 +302,11 @@ class Answer:
             if self.before.exposures is not None:
                 where = f"something pulls on {targets[0]} for a while, and neither before nor after"
                 found = [(w, r + 1) for r, w in spell_windows(self.problem, self.before.exposures)]
+                numbers = [r for _, r in found]
             else:
                 where = where_sentence(self.problem, self.lens[0], strained[0])
                 found = strained_when(self.lens, strained)
             windows = [[*w, r] if several else w for w, r in found]
-        numbers = list(range(1, len(self.lens) + 1))
         return {"kind": kind, "targets": targets, "recordings": numbers, "time_windows": windows, "where": where}
 
     def _series(self, r: int) -> Series:
