@@ -24,7 +24,12 @@ def velocity(system: Simulated, x: Array, u: Array, t: Array) -> Array:
 
 def force(system: Simulated, x: Array, u: Array, t: Array) -> Array:
     """Every force but dry friction and impulses."""
-    return system.at(t, u).rates(x)[system.equations.width :]
+    return rates(system, x, u, t)[system.equations.width :]
+
+
+def rates(system: Simulated, x: Array, u: Array, t: Array) -> Array:
+    """The rate of change of the phase point, dry friction and impulses left out."""
+    return system.at(t, u).rates(x)
 
 
 def energy(system: Simulated, x: Array, u: Array, t: Array) -> Array:

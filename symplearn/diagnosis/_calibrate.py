@@ -40,6 +40,11 @@ class Priors:
     powers: Float[np.ndarray, "stretch value"] = field(default_factory=lambda: np.zeros((0, 0)))  # see `_activity`
     stretches: Int[np.ndarray, " stretch"] = field(default_factory=lambda: np.zeros(0, int))
 
+    def widths(self, problem: Problem) -> Float[np.ndarray, " parameter"]:
+        """Standard deviations of the calibrated parameters; 0 where nothing gives a size."""
+        precision = self.precision[problem.head : problem.head + problem.calibrated.parameters]
+        return np.where(precision > 0, precision, np.inf) ** -0.5
+
     def precision_of(self, problem: Problem, combination: Combination) -> Float[np.ndarray, " z"]:
         """Prior precisions with the entries of a combination filled in."""
         values = self.precision.copy()

@@ -30,6 +30,9 @@ def with_effects(problem: Problem, priors: Priors, motion: Motion) -> Priors:
     for one in problem.equations.candidates:
         amplitudes = slice(one.first, one.first + one.effect.amplitudes)
         scales[amplitudes] = STRENGTH * np.array(_unit(motion, one))
+        if one.effect is effects.HIDDEN:
+            loose = _looseness(problem, priors, motion, one.place)
+            scales[amplitudes] *= np.hypot(1.0, loose / STRENGTH) * np.hypot(1.0, loose)
         if one.effect is effects.DELAY:
             upper[one.first] = _SAMPLES * motion.gap
         if one.effect.places:
@@ -38,12 +41,28 @@ def with_effects(problem: Problem, priors: Priors, motion: Motion) -> Priors:
             centres[place], scales[place] = (low + high) / 2, (high - low) / np.sqrt(12)
             lower[place], upper[place] = low, high
     scales = np.where(np.isfinite(scales) & (scales > 0), scales, 1.0)
-    i = int(np.argmax(motion.forces))
-    push = STRENGTH * motion.forces[i]
-    unseen = np.array([push, push * motion.own_frequency(i)])
+    starts = [_unseen(motion, i, _looseness(problem, priors, motion, i)) for i in range(problem.equations.declared)]
+    unseen = np.array(max(starts))
     fed, stretches = powers(problem, motion)
     return replace(priors, centres=centres, scales=scales, lower=lower, upper=upper, unseen=unseen, powers=fed,
                    stretches=stretches)  # fmt: skip
+
+
+def _looseness(problem: Problem, priors: Priors, motion: Motion, i: int) -> float:
+    """By how many times as much as it is the stiffness of a coordinate may be another, by the priors of what is
+    calibrated.
+
+    Two bodies that a strong spring joins swing slowly together; seen alone, one looks as soft as that. What an unseen
+    one may do is as strong as what the seen one's own stiffness may be.
+    """
+    there = motion.forces[i] / rms(motion.q[:, i])
+    return float(np.linalg.norm(motion.stiffening[i] * priors.widths(problem)) / there)
+
+
+def _unseen(motion: Motion, i: int, loose: float) -> tuple[float, float]:
+    """How strong the force of an unseen oscillator on one coordinate may be at the start, and its rate of change."""
+    push = np.hypot(STRENGTH, loose) * motion.forces[i]
+    return push, push * motion.own_frequency(i) * np.sqrt(np.hypot(1.0, loose))
 
 
 def _unit(motion: Motion, one: Candidate) -> tuple[float, ...]:

@@ -1,7 +1,7 @@
 """The motion that was recorded, as the simulation without effects follows it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -9,6 +9,9 @@ from jaxtyping import Float
 
 from ._along import along_all, force, readings, velocity
 from ._problem import Problem
+
+# Of a parameter, for the derivative of a force that hangs on it smoothly.
+_STEP = 1e-6
 
 
 def rms(values: np.ndarray) -> float:
@@ -32,6 +35,8 @@ class Motion:
     forces: Float[np.ndarray, " d"]  # root mean square
     spreads: Float[np.ndarray, " channel"]  # standard deviation of the expected readings
     times: tuple[Float[np.ndarray, " _"], ...]  # by recording
+    # What the stiffness of each coordinate changes by, per unit of each calibrated parameter.
+    stiffening: Float[np.ndarray, "d parameter"] = field(default_factory=lambda: np.zeros((1, 0)))
 
     @property
     def first(self) -> float:
@@ -70,4 +75,33 @@ def motion_along(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarr
         forces=np.array([rms(push[:, i]) for i in range(d)]),
         spreads=np.array([max(float(np.nanstd(column)), 1e-300) for column in shown.T]),
         times=tuple(r.times[: len(path)] for r, path in zip(problem.rows, paths, strict=True)),
+        stiffening=stiffening(problem, z, paths),
     )
+
+
+def stiffening(
+    problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarray, "_ state"]]
+) -> Float[np.ndarray, "d parameter"]:
+    """What the stiffness of each coordinate along given paths changes by, per unit of each calibrated parameter."""
+    here, out = stiffness(problem, z, paths), []
+    for k in range(problem.head, problem.head + problem.calibrated.parameters):
+        moved, step = z.copy(), _STEP * max(abs(z[k]), 1.0)
+        moved[k] += step
+        out.append((stiffness(problem, moved, paths) - here) / step)
+    return np.reshape(out, (-1, problem.equations.dim)).T
+
+
+def stiffness(
+    problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarray, "_ state"]]
+) -> Float[np.ndarray, " d"]:
+    """How much of the force on each coordinate goes against its place, by regression along given paths."""
+    push, points = along_all(problem, force, z, paths), np.concatenate(paths)
+    return np.array([-regressed(points[:, i], push[:, i]) for i in range(problem.equations.dim)])
+
+
+def regressed(x: Float[np.ndarray, " row"], y: Float[np.ndarray, " row"]) -> float:
+    """The slope of the line through some points; 0 where all lie above each other, or none is finite."""
+    some = np.isfinite(x) & np.isfinite(y)
+    centred = x[some] - x[some].mean() if some.any() else np.zeros(0)
+    square = float(centred @ centred)
+    return float(centred @ y[some]) / square if square > 0 else 0.0

@@ -148,7 +148,7 @@ def _mixture(values: Float[np.ndarray, " kind"]) -> float:
 
 
 def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
-    """Whether the recording says anything about every coefficient of a combination.
+    """Whether the recording says anything about every coefficient of a combination, or how an unseen one swings.
 
     An effect that calibration owns already (a stiffness beside a free stiffness) changes nothing, and its
     posterior is its prior; weighing it would only dilute the others. One that would swing, but fits best where it has
@@ -161,7 +161,11 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
         one = problem.candidate(member)
         amplitudes = slice(place.start, place.start + one.effect.amplitudes)
         scales = found.priors.scales[one.first : one.first + one.effect.amplitudes]
-        known &= bool((sd[amplitudes] < _UNINFORMED * scales).all())
+        shown = bool((sd[amplitudes] < _UNINFORMED * scales).all())
+        if one.effect is HIDDEN:  # how it swings may be seen where how strongly it is joined is not
+            starts = np.stack([problem.unseen(r) for r in problem.members[member].recordings])
+            shown |= bool((sd[starts] < _UNINFORMED * found.priors.unseen).any())
+        known &= shown
         if one.effect is HIDDEN or isinstance(one.effect, Oscillating):
             known &= bool(best.z[place.stop - 1] > found.priors.lower[one.values.stop - 1])
     return bool(np.isfinite(best.log_evidence) and known)

@@ -6,6 +6,7 @@ import numpy as np
 
 from .._effects import HIDDEN
 from ._found import Found, speaker
+from ._modes import along_the_modes
 from ._problem import MOST, Combination, Problem
 from ._prospects import MANY, Prospects
 from ._scan import spacing
@@ -14,6 +15,8 @@ from ._weigher import KEPT, Weigher
 
 # Combinations whose places are moved, and how near the best one is what is looked at.
 _MOVED, _NEAR = 3, 8.0
+# How far behind the best of its size one with an unseen oscillator may be to be tried stiffer, and starts of such.
+_SOFT, _STIFFER = 100.0, 20
 # Combinations like the best of a size that are fitted, and how far behind a regression may see them.
 _ALIKE, _BEHIND = 8, 30.0
 
@@ -49,6 +52,16 @@ class Refinement:
         if starts:
             self.progress("moving times, thresholds and frequencies")
             self.weigher.weigh(starts, whole=True)
+
+    def move_modes(self, size: int) -> None:
+        """Try the best of a size that have an unseen oscillator with more of the stiffness seen or less."""
+        size += len(self.weigher.base)
+        ranked = sorted((c for c in self._mine() if len(c) == size), key=self.found.best, reverse=True)
+        near = [c for c in ranked if self.found.best(c) > self.found.best(ranked[0]) - _SOFT]
+        starts = [start for c in near for start in along_the_modes(self.weigher, c)]
+        if starts:
+            self.progress("moving stiffness between what is seen and what is not")
+            self.weigher.weigh(starts[:_STIFFER], whole=True)
 
     def weigh_like_the_best(self) -> None:
         """What may do as well as the likeliest of every size: some fell behind on the way, from where they began."""
