@@ -36,7 +36,8 @@ def along_the_modes(weigher: Weigher, combination: Combination) -> list[Start]:
     paths = [_path(weigher, combination, r, white.z) for r in range(len(weigher.rows))]
     if not all(np.isfinite(path).all() for path in paths):
         return []
-    moved = _moved(weigher, paths, joined[0], white.z)
+    lower, upper = weigher.found.priors.bounds_of(problem, combination)
+    moved = [z for z in _moved(weigher, paths, joined[0], white.z) if ((lower <= z) & (z <= upper)).all()]
     return [Start(combination, _with_starts(problem, combination, joined[0][0], paths, white.z, z), 0.0) for z in moved]
 
 
@@ -64,7 +65,7 @@ def _moved(
         some = z.copy()
         some[entry] += by
         some[place] = share * (1 - share) * (2 * half) ** 2 / lightness, np.sqrt(2 * centre - stiff)
-        if abs(by) < _REACH * room[k] / abs(change[k]) and problem.calibrated.lower[k] < some[entry]:
+        if abs(by * change[k]) < _REACH * room[k]:
             yield some
 
 

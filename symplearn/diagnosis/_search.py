@@ -92,7 +92,8 @@ class Search:
                 self._weigh_in_batches(starts, self._is_near(size - 1))
             else:
                 break
-            self.refinement.move_modes(size)
+            if self._in_time():
+                self.refinement.move_modes(size)
             if size > 1 and not self._gained(size):
                 break
         self._refine()
