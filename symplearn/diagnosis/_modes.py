@@ -16,7 +16,6 @@ from ._along import along, along_all, force, rates, velocity
 from ._motion import regressed, stiffening, stiffness
 from ._problem import Combination, Problem
 from ._score import Start
-from ._stochastic import free_run
 from ._weigher import Weigher
 
 # Where between the two modes the seen coordinate's own frequency, squared, is put.
@@ -33,19 +32,12 @@ def along_the_modes(weigher: Weigher, combination: Combination) -> list[Start]:
     joined = [(m, place) for m, place in problem.placed(combination) if problem.candidate(m).effect is HIDDEN]
     if not joined or white is None or not np.isfinite(white.log_evidence):
         return []
-    paths = [_path(weigher, combination, r, white.z) for r in range(len(weigher.rows))]
+    paths = weigher.trajectories(white.z, combination)
     if not all(np.isfinite(path).all() for path in paths):
         return []
     lower, upper = weigher.found.priors.bounds_of(problem, combination)
     moved = [z for z in _moved(weigher, paths, joined[0], white.z) if ((lower <= z) & (z <= upper)).all()]
     return [Start(combination, _with_starts(problem, combination, joined[0][0], paths, white.z, z), 0.0) for z in moved]
-
-
-def _path(weigher: Weigher, combination: Combination, recording: int, z: np.ndarray) -> Float[np.ndarray, "row state"]:
-    problem = weigher.problem
-    begin = z[recording * problem.state : (recording + 1) * problem.state]
-    course = weigher.stepper.courses[recording]
-    return free_run(problem, course, z, combination, recording, begin, 0)[1][: weigher.rows[recording]]
 
 
 def _moved(

@@ -19,7 +19,6 @@ from ._refinement import Refinement
 from ._score import Start
 from ._spells import Spells
 from ._start import priors_without_effects, with_states
-from ._stochastic import free_run
 from ._trajectory import LANES, Stepper
 from ._unnamed import Proposal
 from ._weigher import KEPT, Weigher
@@ -138,7 +137,7 @@ class Search:
         again = fit_paths(w.stepper, paths, w.found.priors, self.rows, 3)
         if white is None or not white.converged:
             return again
-        states = self._trajectories(white.z)
+        states = w.trajectories(white.z, self.base)
         starts = [replace(fit, z=white.z, noise=white.noise, paths=states, laplace=None) for fit in paths]
         near = fit_paths(w.stepper, starts, w.found.priors, self.rows, w.path_steps)
         return [max(pair, key=lambda fit: fit.log_evidence) for pair in zip(again, near, strict=True)]
@@ -149,15 +148,9 @@ class Search:
         best = self._null
         ways = [(best.z, best.paths)]
         if not best.converged:
-            ways.append((self.seeds[0], self._trajectories(self.seeds[0])))
+            ways.append((self.seeds[0], self.weigher.trajectories(self.seeds[0], self.base)))
         some = [way for way in ways if all(np.isfinite(path).all() for path in way[1])]
         return min(some or ways[:1], key=lambda way: extent(way[1]))
-
-    def _trajectories(self, z: np.ndarray) -> list[np.ndarray]:
-        """Phase points of the simulation without effects at all fitted rows, by recording."""
-        p, courses = self.problem, self.weigher.stepper.courses
-        begins = [z[r * p.state : (r + 1) * p.state] for r in range(len(self.rows))]
-        return [free_run(p, courses[r], z, self.base, r, x, 0)[1][: self.rows[r]] for r, x in enumerate(begins)]
 
     def _weigh_nothing(self) -> None:
         """The simulation as it is, from many starts: a local optimum here would look like physics left out."""
