@@ -253,7 +253,7 @@ def test_coverage_is_over_repeats_and_over_times():
 
 @pytest.mark.slow  # compiles learning and sampling, and infers two hundred posteriors: a minute
 def test_posteriors_of_the_library_have_uniform_ranks():
-    """Two hundred truths of the decaying motion rank uniformly among their draws at 1 %; narrowed to 0.7 they do not."""
+    """Two hundred truths of a decaying motion rank uniformly among their draws at 1 %; narrowed to 0.7 they do not."""
     # Of eighty the narrowed ones are not always seen (p .016 once); of two hundred they are (5e-12).
     found = ranks.batch_of(STUDIES["decay"], "decay", 1, range(200))
     assert ranks.uniformity(found["ranks"])["uniform"]

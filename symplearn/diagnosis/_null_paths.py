@@ -1,15 +1,17 @@
 """The simulation without effects beside a missing force of any strength: where every search begins."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
 from ._calibrate import Priors
+from ._motion import extent
 from ._noisy import PathFit, fit_paths
 from ._problem import Combination, Problem
 from ._start import typical_forces
-from ._stochastic import run_filter
+from ._stochastic import free_run, run_filter
 from ._trajectory import Stepper
 
 # Intensities of the missing force that are tried, as shares of the forces already there.
@@ -19,12 +21,44 @@ SHARES = np.geomspace(3e-5, 0.3, 8)
 def null_paths(
     stepper: Stepper, seed: Float[np.ndarray, " z"], rows: Sequence[int], priors: Priors, steps: int
 ) -> list[PathFit]:
-    """The simulation without effects under missing forces of several intensities."""
-    problem, noise = stepper.problem, rough_noise(stepper.problem, rows)
-    first = [filtered_path(stepper, rows, r, seed, noise) for r in range(len(rows))]
-    typical = typical_forces(problem, seed, first)
-    starts = [PathFit((), intensity(problem, rows, typical, share), seed, noise, first) for share in SHARES]
-    return fit_paths(stepper, starts, priors, rows, steps)
+    """The simulation without effects under missing forces of several intensities.
+
+    Each begins twice, at a path that strong forces lead along the readings and at the trajectory of `seed`: the first
+    may be thrown out far where little is read, the second where something strong is missing.
+    """
+    problem, noise, every = stepper.problem, rough_noise(stepper.problem, rows), range(len(rows))
+    ways = [[filtered_path(stepper, rows, r, seed, noise) for r in every]]
+    trajectory = [_trajectory(stepper, rows, r, seed) for r in every]
+    if all(np.isfinite(path).all() for path in trajectory):
+        ways.append(trajectory)
+    typical = typical_forces(problem, seed, min(ways, key=extent))
+    starts = [PathFit((), intensity(problem, rows, typical, x), seed, noise, way) for way in ways for x in SHARES]
+    fits = fit_paths(stepper, starts, priors, rows, steps)
+    best = [max(fits[k :: len(SHARES)], key=lambda fit: fit.log_evidence) for k in range(len(SHARES))]
+    return _settled(stepper, best, priors, rows, steps)
+
+
+def _trajectory(stepper: Stepper, rows: Sequence[int], r: int, z: np.ndarray) -> Float[np.ndarray, "row state"]:
+    problem = stepper.problem
+    begin = z[r * problem.state : (r + 1) * problem.state]
+    return free_run(problem, stepper.courses[r], z, (), r, begin, 0)[1][: rows[r]]
+
+
+def _settled(stepper: Stepper, fits: list[PathFit], priors: Priors, rows: Sequence[int], steps: int) -> list[PathFit]:
+    """Fits by rising intensity; what has not settled begins again at the next that has, the stronger one first."""
+    for _ in fits[1:]:
+        begun = {k: near for k, fit in enumerate(fits) if not fit.converged and (near := _settled_beside(fits, k))}
+        starts = [replace(near, intensity=fits[k].intensity, laplace=None) for k, near in begun.items()]
+        again = dict(zip(begun, fit_paths(stepper, starts, priors, rows, steps), strict=True))
+        fits = [max((fit, again.get(k, fit)), key=lambda one: one.log_evidence) for k, fit in enumerate(fits)]
+        if not any(fits[k].converged for k in again):
+            break
+    return fits
+
+
+def _settled_beside(fits: Sequence[PathFit], k: int) -> PathFit | None:
+    beside = [fits[j] for j in (k + 1, k - 1) if 0 <= j < len(fits) and fits[j].converged]
+    return beside[0] if beside else None
 
 
 def beside(fit: PathFit, problem: Problem, rows: Sequence[int], typical: np.ndarray, combination: Combination,
