@@ -72,7 +72,7 @@ def test_every_force_finds_a_path_though_outliers_throw_one_out(stepper, followe
     """Along outliers a strong force leads the path that it begins with far out, and it finds none from there; beside
     the trajectory every force settles."""
     assert all(fit.converged and np.isfinite(fit.log_evidence) for fit in followed)
-    monkeypatch.setattr(paths, "_trajectory", lambda *_: np.full((ROWS, 4), np.nan))
+    monkeypatch.setattr(paths, "trajectories", lambda *_: [np.full((ROWS, 4), np.nan)])
     alone = paths.null_paths(stepper, seed(stepper), [ROWS], priors_without_effects(stepper.problem), STEPS)
     assert not all(fit.converged for fit in alone) and not np.isfinite(alone[-1].log_evidence)
 
@@ -83,8 +83,6 @@ def test_what_has_not_settled_begins_again_beside_it(stepper, followed, k):
     lost = replace(followed[k], paths=[1e9 * path for path in followed[k].paths], laplace=None, converged=False)
     given = [lost if j == k else fit for j, fit in enumerate(followed)]
     found = paths._settled(stepper, given, priors_without_effects(stepper.problem), [ROWS], STEPS)
-    assert found[k].converged and [found[j] is given[j] for j in range(len(given)) if j != k] == [True] * (
-        len(given) - 1
-    )
+    assert found[k].converged and all(found[j] is given[j] for j in range(len(given)) if j != k)
     # Seen: 1e-5 and 1e-3; a fit has settled when its evidence moves by less than 0.05 in a step.
     assert found[k].log_evidence == pytest.approx(followed[k].log_evidence, abs=0.01)

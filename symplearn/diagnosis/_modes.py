@@ -16,6 +16,7 @@ from ._along import along, along_all, force, rates, velocity
 from ._motion import regressed, stiffening, stiffness
 from ._problem import Combination, Problem
 from ._score import Start
+from ._stochastic import trajectories
 from ._weigher import Weigher
 
 # Where between the two modes the seen coordinate's own frequency, squared, is put.
@@ -32,7 +33,7 @@ def along_the_modes(weigher: Weigher, combination: Combination) -> list[Start]:
     joined = [(m, place) for m, place in problem.placed(combination) if problem.candidate(m).effect is HIDDEN]
     if not joined or white is None or not np.isfinite(white.log_evidence):
         return []
-    paths = weigher.trajectories(white.z, combination)
+    paths = trajectories(weigher.stepper, white.z, combination, weigher.rows)
     if not all(np.isfinite(path).all() for path in paths):
         return []
     lower, upper = weigher.found.priors.bounds_of(problem, combination)

@@ -11,7 +11,7 @@ from ._motion import extent
 from ._noisy import PathFit, fit_paths
 from ._problem import Combination, Problem
 from ._start import typical_forces
-from ._stochastic import free_run, run_filter
+from ._stochastic import run_filter, trajectories
 from ._trajectory import Stepper
 
 # Intensities of the missing force that are tried, as shares of the forces already there.
@@ -26,9 +26,9 @@ def null_paths(
     Each begins twice, at a path that strong forces lead along the readings and at the trajectory of `seed`: the first
     may be thrown out far where little is read, the second where something strong is missing.
     """
-    problem, noise, every = stepper.problem, rough_noise(stepper.problem, rows), range(len(rows))
-    ways = [[filtered_path(stepper, rows, r, seed, noise) for r in every]]
-    trajectory = [_trajectory(stepper, rows, r, seed) for r in every]
+    problem, noise = stepper.problem, rough_noise(stepper.problem, rows)
+    ways = [[filtered_path(stepper, rows, r, seed, noise) for r in range(len(rows))]]
+    trajectory = trajectories(stepper, seed, (), rows)
     if all(np.isfinite(path).all() for path in trajectory):
         ways.append(trajectory)
     typical = typical_forces(problem, seed, min(ways, key=extent))
@@ -38,27 +38,23 @@ def null_paths(
     return _settled(stepper, best, priors, rows, steps)
 
 
-def _trajectory(stepper: Stepper, rows: Sequence[int], r: int, z: np.ndarray) -> Float[np.ndarray, "row state"]:
-    problem = stepper.problem
-    begin = z[r * problem.state : (r + 1) * problem.state]
-    return free_run(problem, stepper.courses[r], z, (), r, begin, 0)[1][: rows[r]]
-
-
 def _settled(stepper: Stepper, fits: list[PathFit], priors: Priors, rows: Sequence[int], steps: int) -> list[PathFit]:
     """Fits by rising intensity; what has not settled begins again at the next that has, the stronger one first."""
+    tried: set[tuple[int, int]] = set()
     for _ in fits[1:]:
-        begun = {k: near for k, fit in enumerate(fits) if not fit.converged and (near := _settled_beside(fits, k))}
-        starts = [replace(near, intensity=fits[k].intensity, laplace=None) for k, near in begun.items()]
-        again = dict(zip(begun, fit_paths(stepper, starts, priors, rows, steps), strict=True))
-        fits = [max((fit, again.get(k, fit)), key=lambda one: one.log_evidence) for k, fit in enumerate(fits)]
-        if not any(fits[k].converged for k in again):
-            break
+        begun = {  # of two, the stronger comes last and stays
+            k: j for k in range(len(fits)) for j in (k - 1, k + 1) if _may_begin_at(fits, k, j) and (k, j) not in tried
+        }
+        tried |= set(begun.items())
+        starts = [replace(fits[j], intensity=fits[k].intensity, laplace=None) for k, j in begun.items()]
+        for k, again in zip(begun, fit_paths(stepper, starts, priors, rows, steps), strict=True):
+            fits = [*fits[:k], max(fits[k], again, key=lambda fit: fit.log_evidence), *fits[k + 1 :]]
     return fits
 
 
-def _settled_beside(fits: Sequence[PathFit], k: int) -> PathFit | None:
-    beside = [fits[j] for j in (k + 1, k - 1) if 0 <= j < len(fits) and fits[j].converged]
-    return beside[0] if beside else None
+def _may_begin_at(fits: Sequence[PathFit], k: int, j: int) -> bool:
+    """Whether one fit has not settled and the other, if there is one, has."""
+    return 0 <= j < len(fits) and fits[j].converged and not fits[k].converged
 
 
 def beside(fit: PathFit, problem: Problem, rows: Sequence[int], typical: np.ndarray, combination: Combination,

@@ -3,7 +3,8 @@
 The path of every phase point is fitted with the unknowns by Gauss-Newton (the iterated Kalman smoother of Bell 1994;
 weak-constraint variational assimilation). Linearised about that path, a Kalman filter gives the Gram matrix of the
 innovations as functions of the unknowns, from which step, evidence and scores of effects follow. As the force's
-intensity goes to zero this is the trajectory fit; it never diverges where that does.
+intensity goes to zero this is the trajectory fit; a force holds it to the readings where that diverges, though from a
+start far off it may diverge too.
 """
 
 from typing import NamedTuple

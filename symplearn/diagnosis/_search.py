@@ -19,6 +19,7 @@ from ._refinement import Refinement
 from ._score import Start
 from ._spells import Spells
 from ._start import priors_without_effects, with_states
+from ._stochastic import trajectories
 from ._trajectory import LANES, Stepper
 from ._unnamed import Proposal
 from ._weigher import KEPT, Weigher
@@ -137,7 +138,7 @@ class Search:
         again = fit_paths(w.stepper, paths, w.found.priors, self.rows, 3)
         if white is None or not white.converged:
             return again
-        states = w.trajectories(white.z, self.base)
+        states = trajectories(w.stepper, white.z, self.base, self.rows)
         starts = [replace(fit, z=white.z, noise=white.noise, paths=states, laplace=None) for fit in paths]
         near = fit_paths(w.stepper, starts, w.found.priors, self.rows, w.path_steps)
         return [max(pair, key=lambda fit: fit.log_evidence) for pair in zip(again, near, strict=True)]
@@ -148,7 +149,7 @@ class Search:
         best = self._null
         ways = [(best.z, best.paths)]
         if not best.converged:
-            ways.append((self.seeds[0], self.weigher.trajectories(self.seeds[0], self.base)))
+            ways.append((self.seeds[0], trajectories(self.stepper, self.seeds[0], self.base, self.rows)))
         some = [way for way in ways if all(np.isfinite(path).all() for path in way[1])]
         return min(some or ways[:1], key=lambda way: extent(way[1]))
 

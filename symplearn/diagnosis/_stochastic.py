@@ -17,7 +17,7 @@ from .._model import Gaussian, StateSpaceModel
 from .._smoother import Smoothed, smooth
 from ._calibrate import THINNED
 from ._problem import Combination, Problem
-from ._trajectory import Course, model_at
+from ._trajectory import Course, Stepper, model_at
 
 
 class MissingForce(eqx.Module):
@@ -185,6 +185,15 @@ def free_run(
     )
     rows = slice(start, len(problem.rows[recording].times))
     return np.asarray(readings)[rows], np.asarray(states)[rows]
+
+
+def trajectories(
+    stepper: Stepper, z: Float[np.ndarray, " z"], combination: Combination, rows: Sequence[int]
+) -> list[Float[np.ndarray, "row state"]]:
+    """Phase points of free runs of a combination at the leading rows of every recording, from z's initial states."""
+    p, courses = stepper.problem, stepper.courses
+    begins = [z[r * p.state : (r + 1) * p.state] for r in range(len(rows))]
+    return [free_run(p, courses[r], z, combination, r, x, 0)[1][: rows[r]] for r, x in enumerate(begins)]
 
 
 @eqx.filter_jit

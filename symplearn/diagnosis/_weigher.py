@@ -17,7 +17,6 @@ from ._scatter import law_gain, outlier_evidence, outliers, suspects
 from ._score import Start
 from ._start import windows
 from ._static import weigh_static
-from ._stochastic import free_run
 from ._strength import strength_gain
 from ._trajectory import Stepper
 from ._weighed import Estimate, standardised, weigh_coloured, weigh_white
@@ -60,12 +59,6 @@ class Weigher:
         if any(bad.any() for bad in self.flagged):
             self.stepper = stepper.on(stepper.problem.without(self.flagged))
         self.found = found
-
-    def trajectories(self, z: np.ndarray, combination: Combination) -> list[np.ndarray]:
-        """Phase points (row, state) of free runs of a combination at all fitted rows, by recording."""
-        p, courses = self.problem, self.stepper.courses
-        begins = [z[r * p.state : (r + 1) * p.state] for r in range(len(self.rows))]
-        return [free_run(p, courses[r], z, combination, r, x, 0)[1][: self.rows[r]] for r, x in enumerate(begins)]
 
     def take_out_outliers(self, fits: Sequence[PathFit], priors: Priors, spared: frozenset[int] = frozenset()) -> bool:
         """Leave out the readings that lie far off the path that is likeliest without them, but for the columns that are
