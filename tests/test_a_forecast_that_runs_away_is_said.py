@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from symplearn._recording import Recording
+from symplearn.diagnosis._forecast import _DRAWS, _summary
 from symplearn.diagnosis._record import Forecast
 from symplearn.diagnosis._warnings import far_off
 
@@ -36,3 +37,30 @@ def test_a_forecast_near_what_was_read_is_not_told():
     """Swings three times as wide as what was read are no cause for a warning."""
     wide = 3 * np.cos(np.arange(5))
     assert far_off(forecast(wide, wide), READ) == []
+
+
+def test_where_hardly_any_draw_is_left_nothing_is_told():
+    """Of draws that diverge one after the other, mean and sd are those of the ones that are left, and not known from
+    where fewer than a quarter are; what diverged once does not come back."""
+    number = _DRAWS + 1
+    drawn = np.random.default_rng(0).normal(size=(number, 4, 1))
+    half, few = np.arange(number) % 2 == 0, np.arange(number) % 8 == 0
+    drawn[~half, 1] = np.inf  # back at the next time, which counts for nothing
+    drawn[~few, 3] = np.nan
+    mean, sd = _summary(drawn, np.zeros(number), about_first=False)
+    for t, some in ((0, np.full(number, True)), (1, half), (2, half)):
+        np.testing.assert_allclose(mean[t], drawn[some, t].mean(0), rtol=1e-12)
+        np.testing.assert_allclose(sd[t], drawn[some, t].std(0), rtol=1e-12)
+    assert np.isnan(mean[3]).all() and np.isnan(sd[3]).all()
+    about, around = _summary(drawn, np.zeros(number), about_first=True)
+    np.testing.assert_array_equal(about[:3], drawn[0, :3])
+    np.testing.assert_allclose(around[2], np.sqrt(np.mean((drawn[half, 2] - drawn[0, 2]) ** 2, axis=0)), rtol=1e-12)
+    assert np.isnan(about[3]).all()
+    assert np.isnan(_summary(drawn, np.full(number, -np.inf), about_first=True)[0]).all()
+
+
+def test_what_is_not_known_is_said():
+    """A forecast without numbers from some time on is named with that time, the other not."""
+    lost = np.where(np.arange(5) < 3, 0.5, np.nan)
+    (said,) = far_off(forecast(np.cos(np.arange(5)), lost), READ)
+    assert "y after the findings is empty from t = 13 on" in said

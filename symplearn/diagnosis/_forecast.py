@@ -126,17 +126,24 @@ def _ahead(problem: Problem, recording: Recording, times: np.ndarray) -> tuple[S
     return spans_between(path, pieces, recording.inputs), jnp.asarray(times), jnp.asarray(inputs)
 
 
+@np.errstate(invalid="ignore", over="ignore")  # draws that diverged are not looked at
 def _summary(
     drawn: Float[np.ndarray, "draw time channel"], log_weights: np.ndarray, about_first: bool
 ) -> tuple[Float[np.ndarray, "time channel"], Float[np.ndarray, "time channel"]]:
-    """Mean and sd of draws that stayed finite, or the first and the deviations from it; `InputError` where hardly any
-    did."""
-    good = np.isfinite(drawn).all((1, 2)) & np.isfinite(log_weights)
-    if good.sum() < _DRAWS // 4:
-        raise InputError("--forecast-until: the trajectory diverges before that time; give an earlier one")
-    weights = softened(log_weights[good], least=min(_LEAST, float(good.sum())))
-    centre = drawn[0] if about_first and good[0] else np.einsum("d,dtc->tc", weights, drawn[good])
-    return centre, np.sqrt(np.einsum("d,dtc->tc", weights, (drawn[good] - centre) ** 2))
+    """Mean and sd of the draws that have stayed finite up to each time, or the first and the deviations from it; NaN
+    from where hardly any has."""
+    usable = np.isfinite(log_weights)
+    alive = usable[:, None] & np.logical_and.accumulate(np.isfinite(drawn).all(2), axis=1)
+    weights = np.zeros(len(log_weights))
+    if usable.any():
+        weights[usable] = softened(log_weights[usable], least=min(_LEAST, float(usable.sum())))
+    shares = weights[:, None] * alive
+    shares = np.where(alive.sum(0) < _DRAWS // 4, np.nan, shares / shares.sum(0))
+    values = np.where(alive[..., None], drawn, 0.0)
+    centre = np.einsum("dt,dtc->tc", shares, values)
+    if about_first:
+        centre = np.where((alive[0] & np.isfinite(shares[0]))[:, None], drawn[0], centre)
+    return centre, np.sqrt(np.einsum("dt,dtc->tc", shares, (values - centre) ** 2))
 
 
 def _within(problem: Problem, zs: np.ndarray) -> np.ndarray:

@@ -10,10 +10,10 @@ from ._along import along, along_all, force, readings, velocity
 from ._calibrate import Fits, Priors, calibrate, residuals, weights
 from ._motion import rms
 from ._problem import Problem
-from ._trajectory import Stepper
+from ._trajectory import Predictions, Stepper
 
-# Starts tried for the initial states over a few rows, those of them that are followed on, and how far they are spread.
-_TRIED, _STARTS = 64, 16
+# Initial states drawn, starts tried over a few rows, those of them that are followed on, and how far they are spread.
+_DRAWN, _TRIED, _STARTS = 1024, 64, 16
 _SPREADS = (1e-3, 0.1, 1.0, 10.0)
 # Rows of the first windows, at least so many.
 _SHORT = (8, 14)
@@ -64,9 +64,9 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
     short = [[min(n, least) for n in rows] for least in _SHORT]
     short += windows(rows, (0.02, 0.04, 0.08), max(_SHORT[0], 4 * problem.state))
     tight = _tightened(problem, priors)
-    fits = calibrate(stepper, _scattered(problem, priors), [()] * _TRIED, tight, short[0], 40)
+    fits = calibrate(stepper, _tried(stepper, priors, short[0]), [()] * _TRIED, tight, short[0], 40)
     for number, window in enumerate(short[1:], 1):
-        z = _recombined(problem, fits, short[number - 1])[:_STARTS]
+        z = _recombined(problem, fits.z, fits.predictions, short[number - 1])[:_STARTS]
         held = tight if number < len(_SHORT) + 1 else priors
         fits = calibrate(stepper, z, [()] * _STARTS, held, window, 40)
     order = np.argsort(np.where(np.isfinite(fits.cost), _likelihood(problem, fits, short[-1]), np.inf))
@@ -74,12 +74,20 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
     return Fits([()] * _STARTS, z, fits.noise[order], [], fits.cost[order], fits.converged[order])
 
 
+def _tried(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Float[np.ndarray, "lane z"]:
+    """Where the first fits begin: half as drawn, half those of many draws that follow a few rows best as they are."""
+    drawn = _scattered(stepper.problem, priors)
+    predictions = stepper.predict(drawn, [()] * _DRAWN, rows)
+    best = _recombined(stepper.problem, drawn, predictions, rows)
+    return np.concatenate([best[: _TRIED // 2], drawn[: _TRIED // 2]])
+
+
 def _scattered(problem: Problem, priors: Priors) -> Float[np.ndarray, "lane z"]:
     """Prior means with initial states drawn from their priors, or about them where nothing is known."""
     rng = np.random.default_rng(0)
-    z = np.tile(priors.mean, (_TRIED, 1))
-    spread = np.resize(_SPREADS, _TRIED)
-    noise = rng.normal(size=(_TRIED, problem.head))
+    z = np.tile(priors.mean, (_DRAWN, 1))
+    spread = np.resize(_SPREADS, _DRAWN)
+    noise = rng.normal(size=(_DRAWN, problem.head))
     given = np.tile(np.where(np.isfinite(problem.initial.sd), problem.initial.sd, 0.0), len(problem.rows))
     unknown = np.tile(np.isinf(problem.initial.sd), len(problem.rows))
     z[:, : problem.head] += np.where(unknown, noise * spread[:, None], given * noise)
@@ -112,18 +120,20 @@ def _is_unread_angle(problem: Problem, r: int, z: np.ndarray, x: np.ndarray, i: 
     return True
 
 
-def _recombined(problem: Problem, fits: Fits, rows: Sequence[int]) -> Float[np.ndarray, "lane z"]:
+def _recombined(
+    problem: Problem, lanes: Float[np.ndarray, "lane z"], predictions: list[Predictions], rows: Sequence[int]
+) -> Float[np.ndarray, "lane z"]:
     """Lanes of which the first begins every recording where that one is followed best, the next one second best..."""
     weight = weights(problem, rows)
-    z = fits.z.copy()
-    for r, (x, w) in enumerate(zip(residuals(problem, fits.predictions, weight), weight, strict=True)):
+    z = lanes.copy()
+    for r, (x, w) in enumerate(zip(residuals(problem, predictions, weight), weight, strict=True)):
         number = (w > 0).sum(0)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             misfit = (number * np.log((w * x**2).sum(1) / np.maximum(number, 1))).sum(1)
         order = np.argsort(np.where(np.isnan(misfit), np.inf, misfit))
         # The calibrated values, which were hardly free yet, come with the first recording.
         own = slice(r * problem.state, (r + 1) * problem.state if r else problem.size)
-        z[:, own] = fits.z[order, own]
+        z[:, own] = lanes[order, own]
     return z
 
 

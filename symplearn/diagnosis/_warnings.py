@@ -86,9 +86,13 @@ def _when(problem: Problem, recordings: Sequence[Recording], best: Estimate) -> 
 
 
 def far_off(forecast: Forecast, recording: Recording) -> list[str]:
-    """Which expected readings leave what was read by far, from what time on."""
+    """Which expected readings leave what was read by far, or are not known, from what time on."""
     out = []
     for (name, column), read in zip(forecast.columns.items(), recording.readings.T, strict=True):
+        for label in ("before", "after"):
+            if (lost := ~np.isfinite(column[label])).any():
+                out.append(f"the forecast of {name} {label} the findings is empty from t = "
+                           f"{forecast.times[lost][0]:g} on: the trajectory diverges there")  # fmt: skip
         seen = read[~np.isnan(read)]
         if not len(seen) or np.ptp(seen) == 0:  # what never moved gives no range to compare with
             continue
