@@ -78,7 +78,7 @@ def _expected(
     units = np.concatenate([0 * units[:1], units, -units])
     zs = jnp.asarray(_within(stepper.problem, e.z[stepper.problem.local(0)] + units @ root.T))
     if e.intensity is None:
-        ends, log_weights = _by_all_rows(stepper, e, root, units)
+        zs, ends, log_weights = _by_all_rows(stepper, e, root, units)
     else:
         ends, log_weights = _filtered(stepper, e, zs, state_key), np.zeros(len(units))
     ahead = _ahead(stepper.problem, recording, times)
@@ -96,13 +96,17 @@ def _model(stepper: Stepper) -> tuple[Any, Any, Any]:
 
 def _by_all_rows(
     stepper: Stepper, e: Estimate, root: np.ndarray, units: Float[np.ndarray, "draw local"]
-) -> tuple[Array, Float[np.ndarray, " draw"]]:
-    """Phase points at the last row, and log weights, of draws given all rows; the first is the most probable one."""
+) -> tuple[Array, Array, Float[np.ndarray, " draw"]]:
+    """Draws given all rows, their phase points at the last one, and log weights; the first is the most probable one."""
     problem, given = stepper.problem, stepper.problem.rows[0].readings
     known = taught(stepper, e, root)
     zs = jnp.asarray(_within(problem, known.mean + units @ known.root.T))
     seen, states = _run_through(*_model(stepper), zs, jnp.asarray(problem.onehot(e.combination, 0)))
-    return states[:, len(given) - 1], known.log_weights(units, bent(np.asarray(seen)[:, : len(given)], e.bends), given)
+    return (
+        zs,
+        states[:, len(given) - 1],
+        known.log_weights(units, bent(np.asarray(seen)[:, : len(given)], e.bends), given),
+    )
 
 
 def _filtered(stepper: Stepper, e: Estimate, zs: Array, key: Array) -> Array:

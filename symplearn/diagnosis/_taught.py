@@ -1,9 +1,10 @@
 """What a recording's held-out rows say besides: the phase point at its last row, known from all of them.
 
-An answer is fitted to the rows before, and its parameters stay as they were fitted. But where no force is missing the
-phase point at the end follows from the start and the parameters, so that the rows that were held out tell of it only
-together with these: a start alone cannot make up for a frequency that is slightly wrong. So all are updated together,
-by Gauss-Newton with the fit's posterior as the prior.
+Where no force is missing the phase point at the end follows from the start and the parameters, so that rows that were
+held out tell of it only together with these: a start alone cannot make up for a frequency that is slightly wrong. So
+all are updated together, by Gauss-Newton with the fit's posterior as the prior. And a run goes on with what belongs to
+its end: an orbit that was followed under one attraction and goes on under another is another orbit. What is told of the
+answer stays as it was fitted.
 """
 
 from dataclasses import dataclass

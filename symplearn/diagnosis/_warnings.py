@@ -13,6 +13,8 @@ from ._problem import Problem
 from ._record import Forecast
 from ._weighed import Estimate
 
+# Evidence that was discounted by less than this is not told: by a factor of 1.0, to the digits that are.
+_TOLD = 1 / 1.05
 # A forecast is far off that leaves the middle of what was read by this many times its range.
 _FAR = 10.0
 
@@ -72,7 +74,7 @@ def warnings(
     if found.ahead:
         out.append("the remainder is clear, so answers were also weighed by how well they predict rows that they were "
                    "not fitted to")  # fmt: skip
-    if odds.tempered < 1:
+    if odds.tempered < _TOLD:
         out.append(f"evidence was discounted by a factor of {1 / odds.tempered:.1f}: "
                    "the remainder is not white on the scale of the motion")  # fmt: skip
     return out
