@@ -11,7 +11,7 @@ from experiments import concealed
 from experiments._concealed_equivalent import OWNERS, equivalent, same, swallowed
 from experiments._concealed_figures import confusion, reliability, strength
 from experiments._concealed_results import at_fixed_alarms, brier, calibration, metrics, report, table_of_cases
-from experiments._concealed_score import credible_set, nothing, right, row
+from experiments._concealed_score import credible_set, forecast_error, nothing, right, row
 from experiments._concealed_seal import BrokenSeal, canonical, opened, put, seal, total
 from experiments._concealed_workers import each
 
@@ -206,6 +206,16 @@ def test_a_forecast_counts_as_far_as_it_goes():
     short["forecast"] = {n: v[:2] for n, v in short["forecast"].items()}
     far = DAMPED | {"forecast": [[[0.0], [0.0], [9.0]]]}
     assert row("case_001", far, short, None)["forecast_after"] == pytest.approx(1.0)
+
+
+def test_a_forecast_is_compared_where_the_truth_is():
+    """A right forecast of a swing, eight rows a period, is right between its rows, too, where a straight line would be
+    off by 8 % of the swing."""
+    t = np.arange(24) * np.pi / 4
+    later = t[:-1] + np.pi / 8
+    answer = {"records": [{"after": list(later)}], "forecast": [np.cos(later)[:, None]], "columns": ["y"],
+              "noise": {"y": 1.0}}  # fmt: skip
+    assert forecast_error(answer, {"t": list(t), "y_after": list(np.cos(t))}, "after") < 0.01
 
 
 def test_a_wrong_name_scores_by_its_alternatives():
