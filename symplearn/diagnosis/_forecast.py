@@ -76,10 +76,10 @@ def _expected(
     root = root_of(stepper.problem, e, inflation)
     units = np.asarray(jax.random.normal(unit_key, (_DRAWS // 2, len(root))))
     units = np.concatenate([0 * units[:1], units, -units])
-    zs = jnp.asarray(_within(stepper.problem, e.z[stepper.problem.local(0)] + units @ root.T))
     if e.intensity is None:
         zs, ends, log_weights = _by_all_rows(stepper, e, root, units)
     else:
+        zs = jnp.asarray(_within(stepper.problem, e.z[stepper.problem.local(0)] + units @ root.T))
         ends, log_weights = _filtered(stepper, e, zs, state_key), np.zeros(len(units))
     ahead = _ahead(stepper.problem, recording, times)
     # A force that has acted for a while is over.
@@ -102,11 +102,8 @@ def _by_all_rows(
     known = taught(stepper, e, root)
     zs = jnp.asarray(_within(problem, known.mean + units @ known.root.T))
     seen, states = _run_through(*_model(stepper), zs, jnp.asarray(problem.onehot(e.combination, 0)))
-    return (
-        zs,
-        states[:, len(given) - 1],
-        known.log_weights(units, bent(np.asarray(seen)[:, : len(given)], e.bends), given),
-    )
+    log_weights = known.log_weights(units, bent(np.asarray(seen)[:, : len(given)], e.bends), given)
+    return zs, states[:, len(given) - 1], log_weights
 
 
 def _filtered(stepper: Stepper, e: Estimate, zs: Array, key: Array) -> Array:

@@ -92,7 +92,7 @@ def far_off(forecast: Forecast, recording: Recording) -> list[str]:
     out = []
     for (name, column), read in zip(forecast.columns.items(), recording.readings.T, strict=True):
         for label in ("before", "after"):
-            if (lost := ~np.isfinite(column[label])).any():
+            if (lost := ~np.isfinite(column[label] + column[f"{label}_sd"])).any():
                 out.append(f"the forecast of {name} {label} the findings is empty from t = "
                            f"{forecast.times[lost][0]:g} on: the trajectory diverges there")  # fmt: skip
         seen = read[~np.isnan(read)]
