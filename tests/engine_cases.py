@@ -61,6 +61,16 @@ def solved(rates: Callable, start: Sequence[float], times: np.ndarray, tolerance
     return found.y.T
 
 
+def attracted(mu: float) -> Callable[[float, np.ndarray], list[float]]:
+    """The rates of (x, y, px, py) of a unit mass in the potential -mu/r."""
+
+    def rates(t, s):
+        cubed = np.hypot(s[0], s[1]) ** 3
+        return [s[2], s[3], -mu * s[0] / cubed, -mu * s[1] / cubed]
+
+    return rates
+
+
 def struck(
     rates: Callable, start: Sequence[float], times: np.ndarray, jump: Sequence[float], when: float
 ) -> np.ndarray:

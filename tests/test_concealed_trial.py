@@ -210,7 +210,7 @@ def test_a_forecast_counts_as_far_as_it_goes():
 
 def test_a_forecast_is_compared_where_the_truth_is():
     """A right forecast of a swing, eight rows a period, is right between its rows, too, where a straight line would be
-    off by 8 % of the swing."""
+    off by up to 8 % of the swing."""
     t = np.arange(24) * np.pi / 4
     later = t[:-1] + np.pi / 8
     answer = {"records": [{"after": list(later)}], "forecast": [np.cos(later)[:, None]], "columns": ["y"],

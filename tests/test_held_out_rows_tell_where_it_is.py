@@ -75,12 +75,7 @@ ORBIT, SECONDS = np.array([0.7, -0.1, 0.3, 1.6, 1.5]), 0.13 * np.arange(150)
 
 def orbit(x, times):
     """Phase points (time, 4) of a satellite of given start and attraction, by DOP853, from t = 0 on."""
-
-    def rates(t, s):
-        cubed = np.hypot(s[0], s[1]) ** 3
-        return [s[2], s[3], -x[4] * s[0] / cubed, -x[4] * s[1] / cubed]
-
-    return cases.solved(rates, x[:4], np.union1d(0.0, times))[-len(times) :]
+    return cases.solved(cases.attracted(x[4]), x[:4], np.union1d(0.0, times))[-len(times) :]
 
 
 def test_a_forecast_goes_on_with_the_attraction_that_its_end_belongs_to():
