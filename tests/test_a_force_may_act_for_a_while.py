@@ -11,7 +11,8 @@ from symplearn.diagnosis._found import Found
 from symplearn.diagnosis._locate import strained_when
 from symplearn.diagnosis._noisy import PathFit, fit_paths
 from symplearn.diagnosis._outlook import Outlook
-from symplearn.diagnosis._spells import spells
+from symplearn.diagnosis._prospects import Prospects
+from symplearn.diagnosis._spells import Spells, spells
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
 from symplearn.diagnosis._weigher import Weigher
@@ -95,6 +96,21 @@ def test_its_evidence_pays_for_when_it_acts(weighed):
     # What is chosen covers most of the push and is not much longer.
     times = TIMES[np.flatnonzero(spell.exposures[0])]
     assert min(times[-1], OFF) - max(times[0], ON) > 0.7 * (OFF - ON) and times[-1] - times[0] < 3 * (OFF - ON)
+
+
+def test_what_cannot_come_near_the_best_is_given_up(weighed):
+    """Fits of which those that promise too little stop early give the evidence that full ones give; and where another
+    answer is far ahead of all, none goes on."""
+    weigher, starts = weighed
+    full = weigher.found.of((), "spell")
+    other = Weigher(weigher.stepper, Found(weigher.problem, weigher.found.priors))
+    other.found.add(weigher.found.of((), "force"))
+    fits = Spells(Prospects(other), np.array([0.7]))._add(starts)
+    # A fit has settled when a step moves it by less than 0.05 nats.
+    assert other.found.of((), "spell").log_evidence == pytest.approx(full.log_evidence, abs=0.1)
+    assert sum(other.may_matter(fit, 50.0) for fit in fits) in range(1, len(fits) + 1)
+    other.found.add(replace(full, kind="white", log_evidence=full.log_evidence + 200.0))
+    assert not any(other.may_matter(fit, 50.0) for fit in fits)
 
 
 def test_a_calm_recording_gains_nothing_by_it(weighed):

@@ -57,6 +57,7 @@ def searched(
             options.progress("weighing the best combinations again in finer steps")
             found = search.again(Stepper(finer, options.jobs))
     found, stepper = _with_unnamed(file, recordings, options, search, found)
+    options.progress("comparing how well answers predict ahead")
     look_ahead(search.stepper, found, search.rows)
     return found, stepper
 

@@ -104,7 +104,7 @@ class Search:
         self.progress("weighing missing forces beside the best combinations")
         self._weigh_forces()
         self._weigh_spells()
-        self.weigher.weigh_with_outliers_in()
+        self._weigh_with_outliers_in()
         return self.found
 
     def _begin(self) -> None:
@@ -186,7 +186,7 @@ class Search:
         self._weigh_static()
         self._weigh_forces()
         self._weigh_spells()
-        w.weigh_with_outliers_in()
+        self._weigh_with_outliers_in()
         return self.found
 
     def with_unnamed(self, stepper: Stepper, listed: Sequence[Proposal]) -> Found:
@@ -382,6 +382,11 @@ class Search:
         if self.found.odds(best) > alone + _WORTH and self._in_time():
             self.progress("weighing forces that act for a while")
             Spells(self.prospects, self.typical).weigh(best, _REACH)
+
+    def _weigh_with_outliers_in(self) -> None:
+        if self.base:
+            self.progress("weighing the best combinations with every reading")
+        self.weigher.weigh_with_outliers_in()
 
     def _add_forces(self, combinations: Sequence[Combination], every: int) -> None:
         starts = []

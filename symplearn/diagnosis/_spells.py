@@ -21,6 +21,8 @@ _OVERLAP = 2
 # Single effects that are tried beside a spell, those whose own spells are looked for, places at which an effect is
 # tried, and nats that one must promise.
 _TRIED, _OWN, _PLACES, _WORTH = 4, 2, 60, 2.0
+# Steps after which a fit is given up, and how many nats it then lies behind the best of all with all that it promises.
+_STEPS, _HOPELESS = 4, 50.0
 
 
 class Spells:
@@ -52,7 +54,11 @@ class Spells:
 
     def _add(self, starts: list[PathFit]) -> list[PathFit]:
         w = self.weigher
-        fits = fit_paths(w.stepper, starts, w.found.priors, w.rows, w.path_steps)
+        fits = fit_paths(w.stepper, starts, w.found.priors, w.rows, min(_STEPS, w.path_steps))
+        near = [k for k, fit in enumerate(fits) if not fit.converged and w.may_matter(fit, _HOPELESS)]
+        again = fit_paths(w.stepper, [fits[k] for k in near], w.found.priors, w.rows, w.path_steps)
+        for k, fit in zip(near, again, strict=True):
+            fits[k] = fit
         w.add_paths(fits)
         return fits
 

@@ -271,6 +271,15 @@ class Weigher:
         strength = strength_gain(self.problem, fit.combination, self.found.priors, fit.z, fit.laplace.covariance)
         return strength + (law_gain(self.problem, fit.combination, fit.errors) if fit.converged else 0.0)
 
+    def may_matter(self, fit: PathFit, reach: float) -> bool:
+        """Whether a path comes within so many nats of the best of all, should it go on as its last step promises."""
+        if fit.laplace is None or not np.isfinite(fit.laplace.log_evidence):
+            return False
+        settled = replace(fit, converged=True)
+        evidence = settled.log_evidence + self._granted(settled) - fit.choices + self._owed_beside(fit.combination)
+        top = max(map(self.found.odds, self.found.estimates))
+        return evidence + self.found.prices.log(fit.combination) > top - reach
+
     @property
     def is_long(self) -> bool:
         """Whether the recordings are too long for every combination to see all of them."""
