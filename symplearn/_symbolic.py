@@ -85,6 +85,11 @@ class ArrayFunction:
             raise ValueError(f"expressions hold {sorted(map(str, unknown))}, expected only {self.symbols}")
 
     @cached_property
+    def _used(self) -> list[tuple[int, sympy.Symbol]]:
+        used = set().union(*(e.free_symbols for e in self.expressions))
+        return [(place, symbol) for place, symbol in enumerate(self.symbols) if symbol in used]
+
+    @cached_property
     def _order(self) -> list[sympy.Basic]:
         return bottom_up(self.expressions)
 
@@ -92,8 +97,9 @@ class ArrayFunction:
         xp = self.operations.np
         if len(values) != len(self.symbols):
             raise ValueError(f"expected {len(self.symbols)} values {self.symbols}, received {len(values)}")
-        known = dict(zip(self.symbols, values, strict=True))
-        walk = _Walk(self.operations, values.dtype, known)
+        # Only what is used: to JAX every entry taken is two operations to trace and to compile.
+        known = {symbol: values[place] for place, symbol in self._used}
+        walk = _Walk(self.operations, values.dtype, values.shape[1:], known)
         for part in self._order:
             walk(part)
         results = [walk(e) for e in self.expressions]
@@ -121,10 +127,11 @@ def numpy_function(
 class _Walk:
     """Evaluates a tree bottom-up, each distinct subtree once."""
 
-    def __init__(self, operations: _Operations, dtype: Any, known: dict[sympy.Basic, Any]):
+    def __init__(
+        self, operations: _Operations, dtype: Any, shape: tuple[int, ...], known: dict[sympy.Basic, Any]
+    ):  # fmt: skip
         self.xp, self.integer_pow = operations.np, operations.integer_pow
-        self.dtype, self.known = dtype, known
-        self.shape = next(iter(known.values())).shape if known else ()
+        self.dtype, self.shape, self.known = dtype, shape, known
 
     def __call__(self, expr: sympy.Basic) -> Any:
         if expr not in self.known:
