@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float
 
 from ._calibrate import Priors, weights
 from ._evidence import Laplace, laplace
-from ._path import backward_lanes, forward_lanes
+from ._path import backward_lanes, forward_lanes, linearise
 from ._problem import Combination, Problem
 from ._stochastic import exposure, padded
-from ._trajectory import LANES, Stepper, switches_of
+from ._trajectory import LANES, Stepper
 
 # Steps towards a smaller or larger reading noise are lengthened this much: plain EM is slow where noise is small.
 _HASTE = 1.5
@@ -137,13 +137,16 @@ def _next_noise(known: np.ndarray, noise: np.ndarray, expected: np.ndarray) -> n
 def _forward(stepper, fits: list[PathFit], r: int, rows: int, weight: np.ndarray):
     problem = stepper.problem
     slots = np.stack([fit.z[problem.slots :] for fit in fits])
-    return _pass(stepper, fits, r, rows, weight, slots, np.stack([problem.onehot(fit.combination, r) for fit in fits]))
+    hots = np.stack([problem.onehot(fit.combination, r) for fit in fits])
+    return _pass(stepper, fits, r, rows, weight, slots, hots, [np.nonzero(hot[:-1].any(1))[0] for hot in hots])
 
 
-def _pass(stepper, fits: list[PathFit], r: int, rows: int, weight: np.ndarray, slots: np.ndarray, hots: np.ndarray):
-    """Linearise one recording about every lane's path and filter it."""
-    problem = stepper.problem
-    z = np.stack([fit.z for fit in fits])
+def _pass(
+    stepper, fits: list[PathFit], r: int, rows: int, weight: np.ndarray, slots: np.ndarray, hots: np.ndarray,
+    along: Sequence[np.ndarray],
+):  # fmt: skip
+    """Linearise one recording about every lane's path, `along` some of its slots, and filter it."""
+    problem, course = stepper.problem, stepper.courses[r]
     length = max(len(path) for fit in fits for path in fit.paths)
     variances = []
     for fit in fits:
@@ -152,21 +155,13 @@ def _pass(stepper, fits: list[PathFit], r: int, rows: int, weight: np.ndarray, s
             padded(fit.noise**2 * np.where(used > 0, 1.0 / np.where(used > 0, used, 1.0), 0.0), length, 0.0)
         )
     given = jax.device_put(np.stack(variances))
-    linear, done = forward_lanes(
-        problem.equations,
-        problem.integrator,
-        stepper.courses[r],
-        jax.device_put(np.stack([_prolonged(fit.paths[r], length) for fit in fits])),
-        jax.device_put(z[:, problem.head : problem.slots]),
-        jax.device_put(slots),
-        jax.device_put(hots),
-        jax.device_put(padded(problem.rows[r].readings[:rows], length, np.nan)),
-        given,
-        jax.device_put(np.stack([fit.intensity for fit in fits])),
-        jax.device_put(np.stack([exposure(fit.exposures, r, length) for fit in fits])),
-        switches_of(problem, r, hots),
-    )
-    return linear, given, done
+    paths = np.stack([_prolonged(fit.paths[r], length) for fit in fits])
+    values = np.concatenate([np.stack([fit.z[problem.head : problem.slots] for fit in fits]), slots], axis=1)
+    linear = linearise(stepper, r, paths, values, hots, along, problem.rows[r].readings[:rows])
+    lengths = np.asarray(course.spans.length)[:length]
+    acting = np.stack([lengths * exposure(fit.exposures, r, length) for fit in fits])
+    intensities = np.stack([fit.intensity for fit in fits])
+    return linear, given, forward_lanes(linear, given, jax.device_put(intensities), jax.device_put(acting))
 
 
 def _prolonged(path: np.ndarray, length: int) -> np.ndarray:
@@ -198,23 +193,27 @@ def _integrated(problem: Problem, fit: PathFit, passes, priors: Priors, weight) 
 
 
 def lane_grams(
-    stepper: Stepper, fit: PathFit, laid: Sequence[tuple[np.ndarray, np.ndarray]], rows: Sequence[int], r: int
-) -> list[np.ndarray]:
+    stepper: Stepper, fit: PathFit, laid: Sequence[tuple[np.ndarray, np.ndarray, Sequence[np.ndarray]]],
+    rows: Sequence[int], r: int,
+) -> list[np.ndarray]:  # fmt: skip
     """Gram matrices of one recording's innovations about a path, by column [1, x_0, calibrated, slots].
 
-    **Arguments:** - `laid`: at most `LANES` times the values of the slots and the coefficients that they are.
+    **Arguments:** - `laid`: at most `LANES` times the values of the slots, the coefficients that they are, and the
+    slots of the amplitudes; columns of other slots are 0.
     """
     problem, number = stepper.problem, len(laid)
     fixed = problem.coefficients(r, fit.z, fit.combination) - problem.coefficients(r, fit.z, ())
-    slots, hots = [], []
-    for values, matrix in laid:
+    slots, hots, along = [], [], []
+    for values, matrix, amplitudes in laid:
         hot = matrix.copy()
         hot[-1] += fixed
         slots.append(values)
         hots.append(hot)
+        along.append(np.concatenate(amplitudes))
     lanes = np.arange(LANES) % number
-    weight = weights(problem, rows)[r]
-    _, done = _pass(stepper, [fit] * LANES, r, rows[r], weight, np.stack(slots)[lanes], np.stack(hots)[lanes])[::2]
+    weight, every = weights(problem, rows)[r], [along[k] for k in lanes]
+    given = np.stack(slots)[lanes], np.stack(hots)[lanes], every
+    done = _pass(stepper, [fit] * LANES, r, rows[r], weight, *given)[2]
     sign = np.ones(done.gram.shape[-1])
     sign[1:] = -1.0
     return [np.asarray(done.gram[b]) * np.outer(sign, sign) for b in range(number)]

@@ -7,16 +7,16 @@ intensity goes to zero this is the trajectory fit; a force holds it to the readi
 start far off it may diverge too.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
-from .._augmented_flow import Span
-from .._augmented_system import EVERYTHING, Switches
-from ._trajectory import Course, effect_coefficients, model_at
+from ._trajectory import Stepper
 
 
 class Linear(NamedTuple):
@@ -43,33 +43,29 @@ class Pass(NamedTuple):
 
 
 def linearise(
-    equations, integrator, course: Course, path, calibrated, slots, onehot, readings, switches: Switches = EVERYTHING
-) -> Linear:
-    """Linearise flow and observation about a path (time, state) at theta = [calibrated, slots]."""
-    state, f = path.shape[1], calibrated.shape[0]
-    theta = jnp.concatenate([calibrated, slots])
-    directions = jnp.eye(state + theta.shape[0])
+    stepper: Stepper, r: int, paths: Float[np.ndarray, "lane time state"], values: Float[np.ndarray, "lane theta"],
+    hots: Float[np.ndarray, "lane row coefficient"], slots: Sequence[Int[np.ndarray, " _"]], readings: np.ndarray,
+) -> Linear:  # fmt: skip
+    """Linearise flow and observation of one recording about the paths of at most `LANES` lanes, over the rows that
+    `readings` covers; after them nothing moves and nothing is read.
 
-    def row(x, k):
-        def flow_and_read(joint):
-            x, theta = joint[:state], joint[state:]
-            found = effect_coefficients(theta[f:], onehot)
-            flow, read = model_at(equations, integrator, course, theta[:f], found, switches)
-            start, step, inputs = (leaf[k] for leaf in (course.spans.start, course.spans.step, course.spans.inputs))
-            # One number of substeps for all rows, which are stepped together.
-            span = Span(start, step, inputs, course.spans.pieces[0])
-            return flow(x, span), read(x, (course.times[k], course.inputs[k]))
+    theta are the calibrated values and the slots, whose `values` are given; slopes in slots that are not named are 0.
+    """
+    n, state = len(readings), stepper.problem.state
+    length, channels = paths.shape[1], stepper.problem.channels
+    out, slopes = stepper.about_paths(paths[:, :n], values, hots, slots, r)
+    seen = ~np.isnan(readings)
+    residual = np.where(seen, np.where(seen, readings, 0.0) - out[..., :channels], 0.0)
+    shown = np.where(seen[..., None], np.moveaxis(slopes[..., :channels], 1, -1), 0.0)
+    arrived = np.moveaxis(slopes[:, :, 1:, channels:], 1, -1)
+    defect = out[:, 1:, channels:] - paths[:, 1:n]
+    parts = [defect, arrived[..., :state], arrived[..., state:], residual, shown[..., :state], shown[..., state:]]
+    return Linear(*(jax.device_put(_lengthened(part, length)) for part in parts))
 
-        slope = lambda along: jax.jvp(flow_and_read, (jnp.concatenate([x, theta]),), (along,))  # noqa: E731
-        return jax.vmap(slope, out_axes=(None, -1))(directions)
 
-    n = path.shape[0]
-    (moved, h), (flown, shown) = jax.vmap(row)(path, jnp.arange(n))
-    after = jnp.concatenate([path[1:], moved[-1:]])
-    seen = ~jnp.isnan(readings)
-    residual = jnp.where(seen, jnp.where(seen, readings, 0.0) - h, 0.0)
-    A, T, H, G = flown[..., :state], flown[..., state:], shown[..., :state], shown[..., state:]
-    return Linear(moved - after, A, T, residual, H, G)
+def _lengthened(values: np.ndarray, length: int) -> np.ndarray:
+    """Rows of every lane with zeros after them."""
+    return np.pad(values, [(0, 0), (0, length - values.shape[1])] + [(0, 0)] * (values.ndim - 2))
 
 
 def _diffusion(A: Array, intensity: Array, length: Array) -> Array:
@@ -153,23 +149,5 @@ def backward(linear: Linear, done: Pass, variances: Array, delta: Array) -> Smoo
     return Smooth(shift, own)
 
 
-@eqx.filter_jit
-def forward_lanes(
-    equations, integrator, course, paths, calibrated, slots, onehots, readings, variances, intensities, exposures,
-    switches,
-):  # fmt: skip
-    """Linearise and filter every lane over the leading rows that `paths` (lane, time, state) covers.
-
-    `exposures` (lane, time) is the share of each span in which the missing force acts.
-    """
-    lengths = course.spans.length
-    n = paths.shape[1]
-
-    def lane(path, c, s, onehot, r, q, exposure):
-        linear = linearise(equations, integrator, course, path, c, s, onehot, readings, switches)
-        return linear, forward(linear, r, q, lengths[:n] * exposure)
-
-    return jax.vmap(lane)(paths, calibrated, slots, onehots, variances, intensities, exposures)
-
-
+forward_lanes = eqx.filter_jit(jax.vmap(forward))
 backward_lanes = eqx.filter_jit(jax.vmap(backward))

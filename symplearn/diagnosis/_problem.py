@@ -170,6 +170,12 @@ class Problem:
         width = self.equations.width
         return recording * self.state + np.array([width - 1, 2 * width - 1])
 
+    def moving(self, coefficients: Float[np.ndarray, " coefficient"]) -> Int[np.ndarray, " _"]:
+        """What one recording depends on before its slots: on an unseen oscillator's start only where there is one."""
+        present = coefficients[self.equations.firsts(HIDDEN) + HIDDEN.size].any() if self.equations.hidden else False
+        every = np.arange(self.state + self.calibrated.size)
+        return every if present else np.setdiff1d(every, self.unseen(0) if self.equations.hidden else [])
+
     def coefficients(self, recording: int, z: Float[np.ndarray, " z"], combination: Sequence[int]) -> np.ndarray:
         """The coefficient vector that one recording is stepped with."""
         c = self.calibrated

@@ -137,7 +137,7 @@ def on_path(stepper: Stepper, fit: PathFit, rows: Sequence[int]) -> Grams:
         laid = [layout(problem, units) for units in lanes]
         found: list[list[list[np.ndarray]]] = [[[] for _ in units] for units in lanes]
         for k in range(len(rows)):
-            grams = lane_grams(stepper, fit, [(values, matrix) for values, matrix, _ in laid], rows, k)
+            grams = lane_grams(stepper, fit, laid, rows, k)
             for b, (units, (_, _, amplitudes)) in enumerate(zip(lanes, laid, strict=True)):
                 for u in range(len(units)):
                     some = np.concatenate([np.arange(unknown), unknown + amplitudes[u]])

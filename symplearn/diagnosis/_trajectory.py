@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 import integrators as ig
 
@@ -107,32 +107,36 @@ def switches_of(problem: Problem, recording: int, hots: Float[np.ndarray, "lane 
 
 
 @eqx.filter_jit
-def _sensitivities(equations, integrator, course, zs, onehots, directions, rows, switches):
+def _sensitivities(equations, integrator, course, zs, onehots, directions, rows, switches, paths, anew):
     """Readings (lane, time, channel) and their slopes (lane, direction, time, channel) over the first `rows` rows.
 
-    Along the last axis the phase points follow the readings, so that one program serves `carried` too.
+    Along the last axis the phase points follow the readings, so that one program serves `carried` too, and, where
+    every row begins `anew` at its point of a path (lane, time, state), the linearisation about that path: the phase
+    points are then those that arrive from the row before.
     """
     state, f = 2 * equations.width, course.to_parameters.shape[0]
 
-    def readings(z, onehot):
+    def readings(z, onehot, path):
         coefficients = effect_coefficients(z[state + f :], onehot)
         flow, read = model_at(equations, integrator, course, z[state : state + f], coefficients, switches)
+        moved = z[:state] - jax.lax.stop_gradient(z[:state])  # nothing, with the slope of the start
 
         def body(k, carry):
             x, out = carry
-            seen = read(x, (course.times[k], course.inputs[k]))
+            begun = jnp.where(anew, path[k] + moved, x)
+            seen = read(begun, (course.times[k], course.inputs[k]))
             out = out.at[k].set(jnp.concatenate([seen, x]))
-            return flow(x, jax.tree.map(lambda leaf: leaf[k], course.spans)), out
+            return flow(begun, jax.tree.map(lambda leaf: leaf[k], course.spans)), out
 
         empty = jnp.zeros((course.times.shape[0], len(equations.columns) + state))
         return jax.lax.fori_loop(0, rows, body, (z[:state], empty))[1]
 
-    def lane(z, onehot, along):
+    def lane(z, onehot, along, path):
         # Forward mode: few unknowns, many readings, and a number of rows that is data.
-        slope = lambda tangent: jax.jvp(lambda one: readings(one, onehot), (z,), (tangent,))  # noqa: E731
+        slope = lambda tangent: jax.jvp(lambda one: readings(one, onehot, path), (z,), (tangent,))  # noqa: E731
         return jax.vmap(slope, out_axes=(None, 0))(along)
 
-    return jax.vmap(lane)(zs, onehots, directions)
+    return jax.vmap(lane)(zs, onehots, directions, paths)
 
 
 @dataclass(frozen=True)
@@ -149,12 +153,13 @@ class Stepper:
     def __init__(self, problem: Problem, jobs: int = 1):
         self.problem = problem
         self.courses = courses(problem)
+        self.no_path = jax.device_put(np.zeros((LANES, len(self.courses[0].times), problem.state)))
         self.jobs = jobs
 
     def on(self, problem: Problem) -> "Stepper":
         """The same for a problem that differs only in which readings count."""
         other = Stepper.__new__(Stepper)
-        other.problem, other.courses, other.jobs = problem, self.courses, self.jobs
+        other.problem, other.courses, other.no_path, other.jobs = problem, self.courses, self.no_path, self.jobs
         return other
 
     def predict(
@@ -183,9 +188,11 @@ class Stepper:
         return Predictions(out[:, :rows, : p.channels], slopes)
 
     def _run(
-        self, r: int, local_z: np.ndarray, hots: np.ndarray, along: Sequence[np.ndarray], rows: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Readings and phase points of at most `LANES` lanes and their slopes along the entries that `along` names."""
+        self, r: int, local_z: np.ndarray, hots: np.ndarray, along: Sequence[np.ndarray], rows: int,
+        paths: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Readings and phase points of at most `LANES` lanes and their slopes along the entries that `along` names;
+        with `paths` every row begins anew at its own."""
         number, p = len(local_z), self.problem
         lanes = np.arange(LANES) % number
         width = -(-max(1, *map(len, along)) // DIRECTIONS) * DIRECTIONS
@@ -193,11 +200,12 @@ class Stepper:
         for lane, places in enumerate(along):
             directions[lane, np.arange(len(places)), places] = 1.0
         some, matrices, along_some = (jax.device_put(a[lanes]) for a in (local_z, hots, directions))
-        last, switches = jnp.asarray(rows), switches_of(p, r, hots)
+        last, switches, anew = jnp.asarray(rows), switches_of(p, r, hots), jnp.asarray(paths is not None)
+        begun = self.no_path if paths is None else jax.device_put(paths[lanes])
         parts = [
             _sensitivities(
                 p.equations, p.integrator, self.courses[r], some, matrices, along_some[:, k : k + DIRECTIONS],
-                last, switches,
+                last, switches, begun, anew,
             )
             for k in range(0, width, DIRECTIONS)
         ]  # fmt: skip
@@ -247,6 +255,26 @@ class Stepper:
             found += [(x[:rows], own[: len(places), :rows])
                       for x, own, places in zip(shown, slopes, along[few], strict=True)]  # fmt: skip
         return found
+
+    def about_paths(
+        self, paths: Float[np.ndarray, "lane time state"], values: Float[np.ndarray, "lane theta"], hots: np.ndarray,
+        slots: Sequence[Int[np.ndarray, " _"]], r: int,
+    ) -> tuple[Float[np.ndarray, "lane time _"], Float[np.ndarray, "lane local time _"]]:  # fmt: skip
+        """Readings on paths of at most `LANES` lanes and the phase points that every row arrives at from the one before
+        it, and the slopes of both in each row's own phase point, the calibrated values and the `slots` named.
+
+        `values` are the calibrated ones and those of the slots, `hots` what coefficients these are (`Problem.onehot`).
+        """
+        p, (lanes, rows, state) = self.problem, paths.shape
+        local_z = np.concatenate([np.zeros((lanes, state)), values], axis=1)
+        whole = np.zeros((lanes, len(self.courses[r].times), state))
+        whole[:, :rows] = paths
+        along = [np.concatenate([p.moving(hot[-1]), self._further + own]) for hot, own in zip(hots, slots, strict=True)]
+        out, found = self._run(r, local_z, hots, along, rows, whole)
+        slopes = np.zeros((lanes, local_z.shape[1], rows, out.shape[-1]))
+        for lane, places in enumerate(along):
+            slopes[lane, places] = found[lane, : len(places), :rows]
+        return out[:, :rows], slopes
 
     @property
     def _further(self) -> int:
