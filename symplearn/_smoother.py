@@ -66,6 +66,17 @@ def smooth(
     H, R = jax.vmap(lambda m, P, context: _slope_and_noise(model.read, transform, m, P, context))(
         filtered.predicted_means, filtered.predicted_covariances, contexts
     )
+    return smooth_along(filtered, A, Q, H, R)
+
+
+def smooth_along(
+    filtered: Filtered,
+    A: Float[Array, "interval state state"],
+    Q: Float[Array, "interval state state"],
+    H: Float[Array, "time channel state"],
+    R: Float[Array, "time channel channel"],
+) -> Smoothed:
+    """The same with slopes and noises that are known: of the dynamics, A and Q, and of the readings, H and R."""
     H = jnp.where(filtered.observed[:, :, None], H, 0.0)
     S_inverse = jax.vmap(_masked_inverse)(filtered.innovation_covariances, filtered.observed)
     K = jnp.einsum("kij,kcj,kcd->kid", filtered.predicted_covariances, H, S_inverse)

@@ -106,7 +106,8 @@ class Outlook:
     @cached_property
     def smoothed(self) -> Smoothed:
         """State and noises given all fitted rows."""
-        return run_smoother(*self._filtered)
+        e = self.estimate
+        return run_smoother(self.stepper, self.recording, e.z, e.combination, *self._filtered)
 
     @cached_property
     def last_state(self) -> Float[np.ndarray, " state"]:

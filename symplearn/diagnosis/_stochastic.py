@@ -14,9 +14,10 @@ import integrators as ig
 from .._augmented_flow import Span
 from .._filter import Filtered, unscented_filter
 from .._model import Gaussian, StateSpaceModel
-from .._smoother import Smoothed, smooth
+from .._smoother import Smoothed, smooth_along
 from ._calibrate import THINNED
-from ._problem import Combination, Problem
+from ._path import Linear, linearise
+from ._problem import SLOTS, Combination, Problem
 from ._trajectory import Course, Stepper, model_at
 
 
@@ -89,8 +90,9 @@ _filter = eqx.filter_jit(filter_lane)
 
 
 @eqx.filter_jit
-def _smooth(model, filtered, spans, contexts):
-    return smooth(model, filtered, spans, contexts)
+def _smooth(filtered, force, spans, A, H, variance):
+    R = jnp.broadcast_to(jnp.diag(variance), (H.shape[0], *[variance.shape[0]] * 2))
+    return smooth_along(filtered, A, jax.vmap(force.covariance)(spans), H, R)
 
 
 def row_roots(problem: Problem, recording: int, length: int, ratio: Float[np.ndarray, " channel"]) -> np.ndarray:
@@ -162,10 +164,23 @@ def run_filter(
     return (model, spans, contexts), filtered
 
 
-def run_smoother(parts: Any, filtered: Filtered) -> Smoothed:
-    """Smooth what `run_filter` filtered."""
-    model, spans, contexts = parts
-    return _smooth(model, filtered, spans, contexts)
+def run_smoother(
+    stepper: Stepper, recording: int, z: Float[np.ndarray, " z"], combination: Combination, parts: Any,
+    filtered: Filtered,
+) -> Smoothed:  # fmt: skip
+    """Smooth what `run_filter` filtered, with the slopes of flow and readings at the filter's means: those over the
+    filter's spread, which is small beside the motion, would need one more program that holds the flow."""
+    problem, (model, (spans, exposure), (_, roots)) = stepper.problem, parts
+    hot = np.zeros((1, SLOTS + 1, problem.equations.size))
+    hot[0, -1] = problem.coefficients(recording, z, combination) - problem.coefficients(recording, z, ())
+    values = np.concatenate([z[problem.head : problem.slots], np.zeros(SLOTS)])[None]
+    readings = np.where(np.asarray(filtered.observed), 0.0, np.nan)
+
+    def about(means: Array) -> Linear:
+        return linearise(stepper, recording, np.asarray(means)[None], values, hot, [np.zeros(0, int)], readings)
+
+    A, H = about(filtered.filtered_means).A[0, :-1], about(filtered.predicted_means).H[0] * roots[..., None]
+    return _smooth(filtered, model.process_noise, (spans, exposure), A, H, model.measurement_noise.variance)
 
 
 def free_run(
