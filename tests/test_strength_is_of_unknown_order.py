@@ -83,6 +83,22 @@ def test_two_effects_have_a_width_each(correlated, tolerance):
     assert gain == pytest.approx(np.log(np.mean(each) / density(1.0, 1.0)), abs=tolerance)
 
 
+@pytest.mark.parametrize("alone", [False, True])
+@pytest.mark.parametrize("lowest", [NONE, 0.0, -0.3])
+def test_one_amplitude_gains_what_it_gains_beside_one_that_nothing_is_known_of(lowest, alone):
+    """The short way for one amplitude is the one for many: a second one whose posterior is its prior, all of it wide,
+    changes nothing."""
+    for sd in (1e-5, 1e-3, 0.1, 0.7):
+        for told in (0.0, 2 * sd, 0.5):
+            centre, spread = posterior(np.array([told]), np.array([[sd**2]]))
+            one = mixture_gain(centre, spread, np.zeros(1, int), np.array([lowest]), alone)
+            both = mixture_gain(
+                np.append(centre, 0.0), np.diag([spread[0, 0], 1.0]), np.arange(2), np.array([lowest, NONE]), alone
+            )
+            # Of what nothing is known, a billionth counts as known, so that it has an inverse.
+            assert one == pytest.approx(both, abs=1e-8)
+
+
 def test_the_two_parts_of_one_effect_share_a_width():
     """A cosine and a sine are as wide as one another: one width for both in every term of the mean, and the square is
     of both together."""

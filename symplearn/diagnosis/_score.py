@@ -40,12 +40,14 @@ class Nuisance(NamedTuple):
     active: Bool[np.ndarray, " z"]
     inverse: Float[np.ndarray, "active active"]
     vector: Float[np.ndarray, " active"]
+    step: Float[np.ndarray, " active"]  # to that best
+    bounds: tuple[np.ndarray, np.ndarray]  # of every entry of z
     gain: float = 0.0  # of an unseen start, under the widest prior
 
     @property
     def earned(self) -> float:
         """Log evidence of these unknowns, but for the density of their priors."""
-        return float(0.5 * self.vector @ self.inverse @ self.vector + 0.5 * np.linalg.slogdet(self.inverse)[1])
+        return float(0.5 * self.vector @ self.step + 0.5 * np.linalg.slogdet(self.inverse)[1])
 
 
 def nuisance(
@@ -84,7 +86,7 @@ def _remaining(
         gram[np.ix_(place, place)] += own[: len(place), : len(place)]
     vector = gram[0, 1:] - precision * (z - priors.mean_of(problem, combination))
     found = inverse(gram[1:, 1:][np.ix_(active, active)] + np.diag(precision[active]))
-    return Nuisance(active, found, vector[active])
+    return Nuisance(active, found, vector[active], found @ vector[active], priors.bounds_of(problem, combination))
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
@@ -132,8 +134,8 @@ def score(
         gain += mixture_gain(amplitudes / scales, spread / shape, np.zeros(number, int), lowest / scales)
     larger = tuple(sorted((*combination, member)))
     moved = z.copy()
-    moved[others.active] += others.inverse @ others.vector - after @ amplitudes
-    moved = np.clip(moved, *priors.bounds_of(problem, combination))
+    moved[others.active] += others.step - after @ amplitudes
+    moved = np.clip(moved, *others.bounds)
     ends = [
         placed(problem, at, combination, larger, member, size, unit)
         for at, size in ((moved, amplitudes), (z, np.zeros(number)))
@@ -148,7 +150,7 @@ def _unseen_strength(problem, member: int, priors: Priors, others: Nuisance, aft
         priors.scales[problem.candidate(member).first],
         priors.precision_of(problem, (member,))[_starts(problem, member)] ** -0.5,
     )
-    begin = others.inverse @ others.vector - after @ amplitudes
+    begin = others.step - after @ amplitudes
     cross = -after[some] @ spread
     corner = others.inverse[np.ix_(some, some)] + after[some] @ spread @ after[some].T
     joint = np.block([[spread, cross.T], [cross, corner]])

@@ -11,6 +11,7 @@ nothing at zero (the moment prior of Johnson and Rossell 2010): what is not need
 """
 
 import itertools
+import math
 
 import numpy as np
 from jaxtyping import Float
@@ -118,6 +119,8 @@ def mixture_gain(
     """
     if not (np.isfinite(centre).all() and np.isfinite(spread).all() and (np.diag(spread) > 0).all()):
         return 0.0
+    if len(centre) == 1:  # as most scores are
+        return _gain_of_one(float(centre[0]), float(spread[0, 0]), float(lowest[0]), alone)
     values, vectors = np.linalg.eigh(spread)
     left = np.maximum(1.0 - values, _SILENT)  # what the recording says, as a share of all that is known
     likelihood = (vectors * (np.maximum(values, 1e-300) / left)) @ vectors.T  # covariance without the priors
@@ -131,6 +134,26 @@ def mixture_gain(
     # SciPy's logsumexp would take half as long again for all of this, which every score does.
     gain = float(np.logaddexp.reduce(logs[:-1]) - np.log(len(widths)) - logs[-1])
     return gain if np.isfinite(gain) else 0.0
+
+
+def _gain_of_one(centre: float, variance: float, lowest: float, alone: bool) -> float:
+    """The same for one amplitude, in a fifth of the time: numbers need no matrices."""
+    left = max(1.0 - variance, _SILENT)
+    likelihood, told = variance / left, centre / left
+    information = max(1.0 / max(variance, 1e-300) - 1.0, 1e-300)
+    widths = np.append(_widths(_SEEN / math.sqrt(information), alone), 1.0)
+    prior = widths**2
+    total = likelihood + prior
+    middle, spread = prior * told / total, prior * likelihood / total
+    logs = -0.5 * (told**2 / total + np.log(total))
+    if lowest > -np.inf:
+        logs += log_ndtr((middle - lowest) / np.sqrt(np.maximum(spread, 1e-300))) - log_ndtr(-lowest / widths)
+    if not alone:
+        bound = np.array([lowest])
+        square = _square(middle[:, None], spread[:, None], bound) / _square(0.0 * prior[:, None], prior[:, None], bound)
+        logs[:-1] += np.log(square[:-1, 0])
+    gain = float(np.logaddexp.reduce(logs[:-1]) - math.log(len(widths) - 1) - logs[-1])
+    return gain if math.isfinite(gain) else 0.0
 
 
 def _shares(spread: Float[np.ndarray, "b b"], alone: bool) -> np.ndarray:
