@@ -170,7 +170,7 @@ def run_smoother(
 ) -> Smoothed:  # fmt: skip
     """Smooth what `run_filter` filtered, with the slopes of flow and readings at the filter's means: those over the
     filter's spread, which is small beside the motion, would need one more program that holds the flow."""
-    problem, (model, (spans, exposure), (_, roots)) = stepper.problem, parts
+    problem, (model, (spans, acting), (_, roots)) = stepper.problem, parts
     hot = np.zeros((1, SLOTS + 1, problem.equations.size))
     hot[0, -1] = problem.coefficients(recording, z, combination) - problem.coefficients(recording, z, ())
     values = np.concatenate([z[problem.head : problem.slots], np.zeros(SLOTS)])[None]
@@ -180,7 +180,7 @@ def run_smoother(
         return linearise(stepper, recording, np.asarray(means)[None], values, hot, [np.zeros(0, int)], readings)
 
     A, H = about(filtered.filtered_means).A[0, :-1], about(filtered.predicted_means).H[0] * roots[..., None]
-    return _smooth(filtered, model.process_noise, (spans, exposure), A, H, model.measurement_noise.variance)
+    return _smooth(filtered, model.process_noise, (spans, acting), A, H, model.measurement_noise.variance)
 
 
 def free_run(
