@@ -202,15 +202,8 @@ def test_bounds_are_kept(stepper):
     priors = with_scale(bounded)
     start = priors.mean[None].copy()
     start[:, SEEN] = [1.0, 0.1, -0.8, 0.3, 11.5, 0.05]
-    found = calibrate(_same(stepper, bounded), start, [()], priors, rows(p))
+    found = calibrate(stepper.on(bounded), start, [()], priors, rows(p))
     assert found.z[0, SEEN[4]] == 11.0 and np.isfinite(found.cost[0])
-
-
-def _same(stepper, problem):
-    """A stepper of another problem over the same courses: nothing is compiled anew."""
-    other = Stepper.__new__(Stepper)
-    other.problem, other.courses, other.jobs = problem, stepper.courses, stepper.jobs
-    return other
 
 
 @pytest.mark.parametrize(

@@ -157,7 +157,7 @@ class Stepper:
         self.jobs = jobs
 
     def on(self, problem: Problem) -> "Stepper":
-        """The same for a problem that differs only in which readings count."""
+        """The same for a problem over the same courses, which differs in which readings count or what bounds values."""
         other = Stepper.__new__(Stepper)
         other.problem, other.courses, other.no_path, other.jobs = problem, self.courses, self.no_path, self.jobs
         return other
