@@ -297,10 +297,8 @@ def test_a_scan_of_a_path_predicts_what_its_refit_gains(stepper, priors, fits):
 def test_an_unknown_noise_is_the_likeliest(stepper, priors):
     """A noise that the file does not give becomes that of the largest dense likelihood, unknowns at their best."""
     p = replace(stepper.problem, noise=np.array([np.nan]))
-    blind = Stepper.__new__(Stepper)
-    blind.problem, blind.courses, blind.jobs = p, stepper.courses, 1
     first = replace(start(p, INTENSITY, ()), noise=np.array([0.2]))
-    (found,) = fit_paths(blind, [first], priors, ROWS, 40)
+    (found,) = fit_paths(stepper.on(p), [first], priors, ROWS, 40)
     best = minimize_scalar(
         lambda log: -Dense(p, INTENSITY, False, np.exp(log)).profile_likelihood,
         bounds=(np.log(0.01), np.log(0.2)), method="bounded", options={"xatol": 0.01},
