@@ -137,7 +137,7 @@ def mixture_gain(
 
 
 def _gain_of_one(centre: float, variance: float, lowest: float, alone: bool) -> float:
-    """The same for one amplitude, in a fifth of the time: numbers need no matrices."""
+    """The same for one amplitude, in a third of the time: numbers need no matrices."""
     left = max(1.0 - variance, _SILENT)
     likelihood, told = variance / left, centre / left
     information = max(1.0 / max(variance, 1e-300) - 1.0, 1e-300)
