@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from symplearn.diagnosis._strength import FAINT, FAINT_WIDTHS, WIDTHS, mixture_gain, turning_gain
+from symplearn.diagnosis._strength import FAINT, FAINT_WIDTHS, WIDTHS, mixture_gain, mixture_gains, turning_gain
 
 NONE = -np.inf
 
@@ -86,8 +86,7 @@ def test_two_effects_have_a_width_each(correlated, tolerance):
 @pytest.mark.parametrize("alone", [False, True])
 @pytest.mark.parametrize("lowest", [NONE, 0.0, -0.3])
 def test_one_amplitude_gains_what_it_gains_beside_one_that_nothing_is_known_of(lowest, alone):
-    """The short way for one amplitude is the one for many: a second one whose posterior is its prior, all of it wide,
-    changes nothing."""
+    """A second effect whose posterior is its prior, all of it wide, changes nothing."""
     for sd in (1e-5, 1e-3, 0.1, 0.7):
         for told in (0.0, 2 * sd, 0.5):
             centre, spread = posterior(np.array([told]), np.array([[sd**2]]))
@@ -97,6 +96,22 @@ def test_one_amplitude_gains_what_it_gains_beside_one_that_nothing_is_known_of(l
             )
             # Of what nothing is known, a billionth counts as known, so that it has an inverse.
             assert one == pytest.approx(both, abs=1e-8)
+
+
+@pytest.mark.parametrize("alone", [False, True])
+@pytest.mark.parametrize("lowest", [NONE, 0.0])
+def test_of_many_each_gains_what_it_gains_by_itself(lowest, alone):
+    """Many posteriors at once gain what each does by itself, whatever the others are; one that round-off left without
+    meaning gains nothing and takes nothing from them."""
+    rng = np.random.default_rng(4)
+    some = [posterior(rng.normal(size=2) * sd, sd**2 * np.array([[1.0, 0.4], [0.4, 2.0]])) for sd in (1e-4, 0.01, 0.3)]
+    some += [(np.full(2, np.nan), np.eye(2)), (np.zeros(2), np.zeros((2, 2)))]
+    bounds = np.full(2, lowest)
+    for own in (np.zeros(2, int), np.arange(2)):
+        each = [mixture_gain(*one, own, bounds, alone) for one in some]
+        many = mixture_gains(*map(np.stack, zip(*some, strict=True)), own, bounds, alone)
+        np.testing.assert_allclose(many, each, rtol=1e-12)
+        assert (np.abs(many[:3]) > 0.01).all() and (many[3:] == 0.0).all()
 
 
 def test_the_two_parts_of_one_effect_share_a_width():

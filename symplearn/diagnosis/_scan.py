@@ -6,7 +6,7 @@ amplitude zero, so it is tried on a grid; the best places are where fits begin.
 """
 
 from collections.abc import Callable, Container, Iterator, Sequence
-from itertools import zip_longest
+from itertools import chain, zip_longest
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +16,7 @@ from .._effects import Candidate, Oscillating
 from ._calibrate import Fits, Priors, residuals, weights
 from ._noisy import PathFit, lane_grams
 from ._problem import SLOTS, Combination, Problem
-from ._score import Nuisance, Start, Unit, nuisance, placed, score
+from ._score import Nuisance, Response, Score, Start, Unit, nuisance, placed, response, scores
 from ._trajectory import DIRECTIONS, LANES, Stepper
 
 # Places tried for times and thresholds, and the most frequencies; frequencies this many times pi over the span apart.
@@ -95,7 +95,7 @@ def layout(problem: Problem, lane: Sequence[Unit]) -> tuple[np.ndarray, np.ndarr
 
 # Gram matrices by recording of the columns [1, x_0, calibrated, slots, amplitudes] of every unit of some lanes: what a
 # recording depends on (`Problem.local`) under the combination that was fitted, and the amplitudes that it lacks.
-Grams = Callable[[Sequence[Sequence[Unit]]], list[list[list[np.ndarray]]]]
+Grams = Callable[[Sequence[Sequence[Unit]]], Iterator[list[list[np.ndarray]]]]
 
 
 def on_trajectory(stepper: Stepper, fits: Fits, lane: int, rows: Sequence[int]) -> Grams:
@@ -124,7 +124,7 @@ def on_trajectory(stepper: Stepper, fits: Fits, lane: int, rows: Sequence[int]) 
                     found[b][u].append(flat @ flat.T)
         return found
 
-    return of
+    return lambda lanes: _in_groups(stepper, of, lanes)
 
 
 def on_path(stepper: Stepper, fit: PathFit, rows: Sequence[int]) -> Grams:
@@ -147,7 +147,16 @@ def on_path(stepper: Stepper, fit: PathFit, rows: Sequence[int]) -> Grams:
                     found[b][u].append(full)
         return found
 
-    return of
+    return lambda lanes: _in_groups(stepper, of, lanes)
+
+
+def _in_groups(
+    stepper: Stepper, of: Callable[[Sequence[Sequence[Unit]]], list[list[list[np.ndarray]]]],
+    lanes: Sequence[Sequence[Unit]],
+) -> Iterator[list[list[np.ndarray]]]:  # fmt: skip
+    """Grams of every lane, those of `LANES` at a time."""
+    groups = [lanes[a : a + LANES] for a in range(0, len(lanes), LANES)]
+    return chain.from_iterable(stepper.ahead(of, groups))
 
 
 def _unseen(problem: Problem) -> np.ndarray:
@@ -164,18 +173,32 @@ def scan(
     Places of the candidates that are `chosen` are the best already, and no neighbours of each other.
     """
     lanes = list(packed(problem, units))
-    found: dict[int, list[tuple[float, Start]]] = {}
     nuisances: dict[int, Nuisance] = {}
-    for a in range(0, len(lanes), LANES):
-        some = lanes[a : a + LANES]
-        for group, by_unit in zip(some, grams(some), strict=True):
-            for unit, by_recording in zip(group, by_unit, strict=True):
-                for member in _members(problem, unit, combination):
-                    others = nuisance(problem, by_recording, z, combination, priors, member, nuisances)
-                    start = score(problem, by_recording, z, combination, priors, unit, member, others)
-                    if start is not None:
-                        found.setdefault(member, []).append((0.0 if unit.place is None else unit.place, start))
-    return [start for member, listed in found.items() for start in _peaks(listed, problem.whole(member) in chosen)]
+    tried: list[tuple[Response, Nuisance]] = []
+    for group, by_unit in zip(lanes, grams(lanes), strict=True):
+        for unit, by_recording in zip(group, by_unit, strict=True):
+            for member in _members(problem, unit, combination):
+                others = nuisance(problem, by_recording, z, combination, priors, member, nuisances)
+                tried.append((response(problem, by_recording, unit, member), others))
+    found: dict[int, list[Score]] = {}
+    for scored in _scored(problem, tried, z, priors):
+        found.setdefault(scored.member, []).append(scored)
+    return [one.start(problem, z, combination)
+            for member, listed in found.items() for one in _peaks(listed, problem.whole(member) in chosen)]  # fmt: skip
+
+
+def _scored(
+    problem: Problem, tried: Sequence[tuple[Response, Nuisance]], z: Float[np.ndarray, " z"], priors: Priors
+) -> list[Score]:
+    """Scores in the order of the responses, like ones together."""
+    alike: dict[tuple[int, int, bool], list[int]] = {}
+    for k, (told, others) in enumerate(tried):
+        effect = problem.candidate(told.member).effect
+        alike.setdefault((id(others), effect.amplitudes, effect.positive), []).append(k)
+    found: dict[int, Score | None] = {}
+    for some in alike.values():
+        found |= zip(some, scores(problem, [tried[k][0] for k in some], z, priors, tried[some[0]][1]), strict=True)
+    return [one for k in range(len(tried)) if (one := found[k]) is not None]
 
 
 def noise_starts(problem: Problem, fits: Fits, rows: Sequence[int]) -> list[Start]:
@@ -205,11 +228,11 @@ def _members(problem: Problem, unit: Unit, combination: Combination) -> list[int
     return [m for m in members if problem.is_possible((*combination, m))]
 
 
-def _peaks(listed: list[tuple[float, Start]], apart: bool) -> list[Start]:
+def _peaks(listed: list[Score], apart: bool) -> list[Score]:
     """The best places that are no neighbours of a better one; all places are `apart` where none is."""
-    listed = sorted(listed, key=lambda pair: pair[0])
-    gains = np.array([start.gain for _, start in listed])
+    listed = sorted(listed, key=lambda one: 0.0 if one.unit.place is None else one.unit.place)
+    gains = np.array([one.gain for one in listed])
     padded = np.concatenate([[-np.inf], gains, [-np.inf]])
     peak = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:]) | apart
     ranked = sorted(np.nonzero(peak)[0], key=lambda k: -gains[k])
-    return [listed[k][1] for k in ranked[:BEST]]
+    return [listed[k] for k in ranked[:BEST]]

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from .. import _effects as effects
 from ._calibrate import Priors
 from ._problem import Combination, Problem
-from ._strength import mixture_gain
+from ._strength import mixture_gain, mixture_gains
 
 
 @dataclass(frozen=True)
@@ -89,74 +89,108 @@ def _remaining(
     return Nuisance(active, found, vector[active], found @ vector[active], priors.bounds_of(problem, combination))
 
 
-def inverse(matrix: np.ndarray) -> np.ndarray:
+def inverse(matrix: Float[np.ndarray, "*lane n n"]) -> Float[np.ndarray, "*lane n n"]:
     """The inverse; NaN where there is none. A direction that nothing holds keeps a wide, finite spread."""
     with np.errstate(all="ignore"):  # a trajectory that ran away is told by NaN
-        scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-        scaled = matrix / np.outer(scale, scale)
-        if not np.isfinite(scaled).all():
-            return np.full_like(matrix, np.nan)
-        values, vectors = np.linalg.eigh(scaled)
-        return (vectors / np.maximum(values, 1e-13)) @ vectors.T / np.outer(scale, scale)
+        scale = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
+        shape = scale[..., :, None] * scale[..., None, :]
+        scaled = matrix / shape
+        sound = np.isfinite(scaled).all((-2, -1))[..., None, None]
+        values, vectors = np.linalg.eigh(np.where(sound, scaled, np.eye(matrix.shape[-1])))
+        found = (vectors / np.maximum(values, 1e-13)[..., None, :]) @ vectors.mT / shape
+        return np.where(sound, found, np.nan)
 
 
-def score(
-    problem: Problem, by_recording: Sequence[np.ndarray], z, combination: Combination, priors: Priors, unit: Unit,
-    member: int, others: Nuisance,
-) -> Start | None:  # fmt: skip
-    """The step that a unit's amplitudes and everything else would take, and what it gains."""
-    one = problem.candidate(member)
-    number = one.effect.amplitudes
+class Response(NamedTuple):
+    """What the readings say of a unit's amplitudes, where it is one member: Gram sums over that member's recordings."""
+
+    unit: Unit
+    member: int
+    cross: Float[np.ndarray, "z amplitude"]  # with every other unknown
+    square: Float[np.ndarray, "amplitude amplitude"]
+    vector: Float[np.ndarray, " amplitude"]  # with the error
+
+
+def response(problem: Problem, by_recording: Sequence[np.ndarray], unit: Unit, member: int) -> Response:
+    """From the Gram matrices of a unit's columns."""
+    number = problem.candidate(member).effect.amplitudes
     cross, square, vector = np.zeros((problem.size, number)), np.zeros((number, number)), np.zeros(number)
     for r in problem.members[member].recordings:
         own, gram = problem.local(r), by_recording[r]
         k = 1 + len(own)
         cross[own] += gram[1:k, k:]
         square, vector = square + gram[k:, k:], vector + gram[0, k:]
-    cross = cross[others.active]
-    scales = priors.scales[one.first : one.first + number]
+    return Response(unit, member, cross, square, vector)
+
+
+class Score(NamedTuple):
+    """Where a unit's amplitudes and everything else would step, and what that gains."""
+
+    unit: Unit
+    member: int
+    gain: float
+    amplitudes: Float[np.ndarray, " amplitude"]
+    moved: Float[np.ndarray, " z"]  # everything else
+
+    def start(self, problem: Problem, z: Float[np.ndarray, " z"], combination: Combination) -> Start:
+        """Where a fit of the combination and this member begins."""
+        larger = tuple(sorted((*combination, self.member)))
+        begin, still = (placed(problem, at, combination, larger, self.member, size, self.unit)
+                        for at, size in ((self.moved, self.amplitudes), (z, 0.0 * self.amplitudes)))  # fmt: skip
+        return Start(larger, begin, self.gain, still)
+
+
+@np.errstate(all="ignore")  # what is not finite is told by None
+def scores(
+    problem: Problem, responses: Sequence[Response], z: Float[np.ndarray, " z"], priors: Priors, others: Nuisance
+) -> list[Score | None]:
+    """The score of every response, of effects that have as many amplitudes and the same signs; None where there is no
+    step."""
+    ones = [problem.candidate(one.member) for one in responses]
+    effect, number = ones[0].effect, ones[0].effect.amplitudes
+    scales = np.stack([priors.scales[one.first : one.first + number] for one in ones])
+    cross = np.stack([one.cross for one in responses])[:, others.active]
+    square, vector = np.stack([one.square for one in responses]), np.stack([one.vector for one in responses])
     after = others.inverse @ cross  # how the others follow a unit of each amplitude
     # What the others can take over wholly leaves a difference of round-off, not less than nothing.
-    left = square - cross.T @ after + np.diag(scales**-2.0 + 1e-12 * np.diag(square))
-    spread = inverse(left)
-    push = vector - after.T @ others.vector
-    amplitudes = spread @ push
-    if not np.isfinite(amplitudes).all() or (one.effect.positive and amplitudes[0] < 0):
-        return None
-    lowest = np.full(number, 0.0 if one.effect.positive else -np.inf)
-    if one.effect.positive:
-        amplitudes = np.maximum(amplitudes, 0.0)
-    gain = others.gain + 0.5 * push @ amplitudes + 0.5 * np.linalg.slogdet(spread)[1] - np.log(scales).sum()
-    if one.effect is effects.HIDDEN:
-        gain += _unseen_strength(problem, member, priors, others, after, amplitudes, spread)
+    held = scales**-2.0 + 1e-12 * np.diagonal(square, axis1=1, axis2=2)
+    spread = inverse(square - cross.mT @ after + held[:, :, None] * np.eye(number))
+    push = vector - np.einsum("lza,z->la", after, others.vector)
+    amplitudes = np.einsum("lab,lb->la", spread, push)
+    sound = np.isfinite(amplitudes).all(1) & ~(effect.positive & (amplitudes[:, 0] < 0))
+    lowest = np.full(number, -np.inf)
+    if effect.positive:
+        amplitudes, lowest = np.maximum(amplitudes, 0.0), np.zeros(number)
+    gains = others.gain + 0.5 * (push * amplitudes).sum(1) + 0.5 * np.linalg.slogdet(spread)[1] - np.log(scales).sum(1)
+    steps = others.step - np.einsum("lza,la->lz", after, amplitudes)
+    if effect is effects.HIDDEN:
+        gains += [_unseen_strength(problem, one.member, priors, others, *lane)
+                  for one, *lane in zip(responses, after, amplitudes, spread, steps, strict=True)]  # fmt: skip
     else:
-        shape = np.outer(scales, scales)
-        gain += mixture_gain(amplitudes / scales, spread / shape, np.zeros(number, int), lowest / scales)
-    larger = tuple(sorted((*combination, member)))
-    moved = z.copy()
-    moved[others.active] += others.step - after @ amplitudes
+        shape = scales[:, :, None] * scales[:, None, :]
+        gains += mixture_gains(amplitudes / scales, spread / shape, np.zeros(number, int), lowest)
+    moved = np.repeat(z[None], len(ones), axis=0)
+    moved[:, others.active] += steps
     moved = np.clip(moved, *others.bounds)
-    ends = [
-        placed(problem, at, combination, larger, member, size, unit)
-        for at, size in ((moved, amplitudes), (z, np.zeros(number)))
-    ]
-    return Start(larger, ends[0], float(gain), ends[1])
+    return [Score(one.unit, one.member, float(gains[k]), amplitudes[k], moved[k]) if sound[k] else None
+            for k, one in enumerate(responses)]  # fmt: skip
 
 
-def _unseen_strength(problem, member: int, priors: Priors, others: Nuisance, after, amplitudes, spread) -> float:
+def _unseen_strength(
+    problem: Problem, member: int, priors: Priors, others: Nuisance, after: np.ndarray, amplitudes: np.ndarray,
+    spread: np.ndarray, step: np.ndarray,
+) -> float:  # fmt: skip
     """What an unseen oscillator gains for being of any strength: its amplitude and its start together."""
     some = np.isin(np.nonzero(others.active)[0], _starts(problem, member))
     scales = np.append(
         priors.scales[problem.candidate(member).first],
         priors.precision_of(problem, (member,))[_starts(problem, member)] ** -0.5,
     )
-    begin = others.step - after @ amplitudes
     cross = -after[some] @ spread
     corner = others.inverse[np.ix_(some, some)] + after[some] @ spread @ after[some].T
     joint = np.block([[spread, cross.T], [cross, corner]])
-    centre, lowest = np.append(amplitudes, begin[some]), np.append(0.0, np.full(some.sum(), -np.inf))
-    shape = np.outer(scales, scales)
-    return mixture_gain(centre / scales, joint / shape, np.zeros(len(centre), int), lowest)
+    centre, lowest = np.append(amplitudes, step[some]), np.append(0.0, np.full(some.sum(), -np.inf))
+    return mixture_gain(centre / scales, joint / np.outer(scales, scales), np.zeros(len(centre), int), lowest)
 
 
 def placed(problem, z, combination, larger, member, amplitudes, unit: Unit) -> np.ndarray:

@@ -34,7 +34,7 @@ _SMALL, _ALIKE = 24, 4
 # Combinations that a missing force is tried beside.
 _FORCED = 6
 # Combinations that are fitted between two looks at the clock.
-_BATCH = 24
+_BATCH = 32
 # Of each size, combinations whose clock may wander, however far behind.
 _SIMPLE = 2
 # Combinations that are weighed again in finer steps, or beside a force that goes with place.

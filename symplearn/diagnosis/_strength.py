@@ -11,7 +11,6 @@ nothing at zero (the moment prior of Johnson and Rossell 2010): what is not need
 """
 
 import itertools
-import math
 
 import numpy as np
 from jaxtyping import Float
@@ -76,7 +75,7 @@ def turning_gain(centre: np.ndarray, spread: np.ndarray, scales: np.ndarray, alo
     """
     if not (np.isfinite(centre).all() and np.isfinite(spread).all()):
         return 0.0
-    size = _widths(_SEEN * np.sqrt(spread[0, 0]) / scales[0], alone)
+    size = _widths(np.asarray(_SEEN * np.sqrt(spread[0, 0]) / scales[0]), alone)
     values, vectors = np.linalg.eigh(spread)
     root = vectors * np.sqrt(np.maximum(values, 0.0))  # round-off may leave one below zero
     grid = np.linspace(-_REACH, _REACH, _POINTS)
@@ -107,7 +106,6 @@ def _entries(problem: Problem, combination: Combination, member: int) -> np.ndar
     return np.concatenate([np.arange(place.start, place.start + effect.amplitudes), *unseen]).astype(int)
 
 
-@np.errstate(all="ignore")  # a spread that round-off left without meaning gains nothing
 def mixture_gain(
     centre: Float[np.ndarray, " a"], spread: Float[np.ndarray, "a a"], own: np.ndarray, lowest: Float[np.ndarray, " a"],
     alone: bool = False,
@@ -117,50 +115,40 @@ def mixture_gain(
     **Arguments:** - `own`: the number of the effect that each entry belongs to. - `lowest`: bounds of the entries. -
     `alone`: whether an effect too weak to be seen counts.
     """
-    if not (np.isfinite(centre).all() and np.isfinite(spread).all() and (np.diag(spread) > 0).all()):
-        return 0.0
-    if len(centre) == 1:  # as most scores are
-        return _gain_of_one(float(centre[0]), float(spread[0, 0]), float(lowest[0]), alone)
+    return float(mixture_gains(centre[None], spread[None], own, lowest, alone)[0])
+
+
+@np.errstate(all="ignore")  # a spread that round-off left without meaning gains nothing
+def mixture_gains(
+    centre: Float[np.ndarray, "lane a"], spread: Float[np.ndarray, "lane a a"], own: np.ndarray,
+    lowest: Float[np.ndarray, " a"], alone: bool = False,
+) -> Float[np.ndarray, " lane"]:  # fmt: skip
+    """The same for many posteriors of like effects at once."""
+    a, effects = centre.shape[1], int(own[-1]) + 1
+    sound = np.isfinite(centre).all(1) & np.isfinite(spread).all((1, 2)) & (_diagonal(spread) > 0).all(1)
+    spread = np.where(sound[:, None, None], spread, 0.5 * np.eye(a))
     values, vectors = np.linalg.eigh(spread)
     left = np.maximum(1.0 - values, _SILENT)  # what the recording says, as a share of all that is known
-    likelihood = (vectors * (np.maximum(values, 1e-300) / left)) @ vectors.T  # covariance without the priors
-    told = vectors @ ((vectors.T @ centre) / left)
-    shares = [_shares(spread[np.ix_(own == k, own == k)], alone) for k in range(own[-1] + 1)]
-    widths = np.array(list(itertools.product(*shares)))[:, own]
+    likelihood = (vectors * (np.maximum(values, 1e-300) / left)[:, None]) @ vectors.mT  # covariance without the priors
+    along = np.einsum("lij,li->lj", vectors, np.where(sound[:, None], centre, 0.0))
+    told = np.einsum("lij,lj->li", vectors, along / left)
+    shares = np.stack([_shares(spread[:, own == k][:, :, own == k], alone) for k in range(effects)], axis=1)
+    choices = np.array(list(itertools.product(range(shares.shape[-1]), repeat=effects)))
+    widths = shares[:, np.arange(effects), choices][..., own]
     # The widest priors last, whose effects may be too weak to be seen.
-    logs, squares = _log_weights(told, likelihood, np.concatenate([widths, np.ones((1, len(own)))]), lowest)
+    every = np.concatenate([widths, np.ones((len(centre), 1, a))], axis=1)
+    logs, squares = _log_weights(told, likelihood, every, lowest)
     if not alone:
-        logs[:-1] += sum(np.log(squares[:-1, own == k].mean(1)) for k in range(own[-1] + 1))
-    # SciPy's logsumexp would take half as long again for all of this, which every score does.
-    gain = float(np.logaddexp.reduce(logs[:-1]) - np.log(len(widths)) - logs[-1])
-    return gain if np.isfinite(gain) else 0.0
+        logs[:, :-1] += sum(np.log(squares[:, :-1, own == k].mean(-1)) for k in range(effects))
+    gains = np.logaddexp.reduce(logs[:, :-1], axis=1) - np.log(len(choices)) - logs[:, -1]
+    return np.where(sound & np.isfinite(gains), gains, 0.0)
 
 
-def _gain_of_one(centre: float, variance: float, lowest: float, alone: bool) -> float:
-    """The same for one amplitude, in a third of the time: numbers need no matrices."""
-    left = max(1.0 - variance, _SILENT)
-    likelihood, told = variance / left, centre / left
-    information = max(1.0 / max(variance, 1e-300) - 1.0, 1e-300)
-    widths = np.append(_widths(_SEEN / math.sqrt(information), alone), 1.0)
-    prior = widths**2
-    total = likelihood + prior
-    middle, spread = prior * told / total, prior * likelihood / total
-    logs = -0.5 * (told**2 / total + np.log(total))
-    if lowest > -np.inf:
-        logs += log_ndtr((middle - lowest) / np.sqrt(np.maximum(spread, 1e-300))) - log_ndtr(-lowest / widths)
-    if not alone:
-        bound = np.array([lowest])
-        square = _square(middle[:, None], spread[:, None], bound) / _square(0.0 * prior[:, None], prior[:, None], bound)
-        logs[:-1] += np.log(square[:-1, 0])
-    gain = float(np.logaddexp.reduce(logs[:-1]) - math.log(len(widths) - 1) - logs[-1])
-    return gain if math.isfinite(gain) else 0.0
-
-
-def _shares(spread: Float[np.ndarray, "b b"], alone: bool) -> np.ndarray:
+def _shares(spread: Float[np.ndarray, "lane b b"], alone: bool) -> Float[np.ndarray, "lane width"]:
     """Widths of one effect's prior, in that of the widest."""
     values = np.clip(np.linalg.eigvalsh(spread), 1e-300, None)
-    information = float(np.mean(np.maximum(1.0 / values - 1.0, 0.0)))
-    return _widths(_SEEN / np.sqrt(max(information, 1e-300)), alone)
+    information = np.mean(np.maximum(1.0 / values - 1.0, 0.0), axis=-1)
+    return _widths(_SEEN / np.sqrt(np.maximum(information, 1e-300)), alone)
 
 
 def faint_share(sd: float) -> float:
@@ -168,32 +156,38 @@ def faint_share(sd: float) -> float:
     return float(np.clip(np.log(_SEEN * max(sd, 1e-300) / FAINT) / -np.log(FAINT), 0.0, 1.0))
 
 
-def _widths(narrowest: float, alone: bool) -> np.ndarray:
+def _widths(narrowest: Float[np.ndarray, "*lane"], alone: bool) -> Float[np.ndarray, "*lane width"]:
+    """All of them the widest where nothing is seen of any."""
     if alone:
-        return np.geomspace(FAINT, 1.0, FAINT_WIDTHS)
-    return np.geomspace(max(narrowest, 1e-12), 1.0, WIDTHS) if narrowest < 1.0 else np.ones(1)
+        return np.broadcast_to(np.geomspace(FAINT, 1.0, FAINT_WIDTHS), (*np.shape(narrowest), FAINT_WIDTHS))
+    return np.geomspace(np.clip(narrowest, 1e-12, 1.0), 1.0, WIDTHS, axis=-1)
+
+
+def _diagonal(matrices: Float[np.ndarray, "*lane a a"]) -> Float[np.ndarray, "*lane a"]:
+    return np.diagonal(matrices, axis1=-2, axis2=-1)
 
 
 def _log_weights(
-    told: np.ndarray, likelihood: np.ndarray, widths: np.ndarray, lowest: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    told: Float[np.ndarray, "lane a"], likelihood: Float[np.ndarray, "lane a a"],
+    widths: Float[np.ndarray, "lane choice a"], lowest: Float[np.ndarray, " a"],
+) -> tuple[Float[np.ndarray, "lane choice"], Float[np.ndarray, "lane choice a"]]:  # fmt: skip
     """Log evidence of every choice of widths, up to one constant, and by entry the posterior's mean square in the
     prior's."""
     prior = widths**2
-    total = likelihood + prior[:, :, None] * np.eye(len(told))
-    scale = np.sqrt(np.diagonal(total, axis1=1, axis2=2))
-    scales = scale[:, :, None] * scale[:, None, :]
-    correlation = total / scales + _ROUND_OFF * np.eye(len(told))  # which two like unknowns may leave singular
+    total = likelihood[:, None] + prior[..., None] * np.eye(told.shape[-1])
+    scale = np.sqrt(_diagonal(total))
+    scales = scale[..., :, None] * scale[..., None, :]
+    correlation = total / scales + _ROUND_OFF * np.eye(told.shape[-1])  # which two like unknowns may leave singular
     inverse = np.linalg.inv(correlation) / scales
-    solved = inverse @ told
-    out = -0.5 * solved @ told - 0.5 * np.linalg.slogdet(correlation)[1] - np.log(scale).sum(1)
+    solved = np.einsum("lcij,lj->lci", inverse, told)
+    out = -0.5 * np.einsum("lci,li->lc", solved, told) - 0.5 * np.linalg.slogdet(correlation)[1]
+    out -= np.log(scale).sum(-1)
     some = np.isfinite(lowest)
-    centre, covariance = prior * solved, prior[:, :, None] * (inverse @ likelihood)
+    centre, covariance = prior * solved, prior[..., None] * (inverse @ likelihood[:, None])
     if some.any():
-        out = out + orthants(centre[:, some] - lowest[some], covariance[:, some][:, :, some])
-        out = out - log_ndtr(-lowest[some] / widths[:, some]).sum(1)
-    variance = np.diagonal(covariance, axis1=1, axis2=2)
-    return out, _square(centre, variance, lowest) / _square(np.zeros_like(centre), prior, lowest)
+        out += orthants(centre[..., some] - lowest[some], covariance[..., some, :][..., some])
+        out -= log_ndtr(-lowest[some] / widths[..., some]).sum(-1)
+    return out, _square(centre, _diagonal(covariance), lowest) / _square(np.zeros_like(centre), prior, lowest)
 
 
 def _square(centre: np.ndarray, variance: np.ndarray, lowest: np.ndarray) -> np.ndarray:

@@ -1,10 +1,11 @@
 """Trajectories of many combinations at once, with their sensitivities: one compiled function serves them all."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from itertools import chain
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -22,6 +23,9 @@ from ._problem import Combination, Problem
 
 DIRECTIONS = 8  # slopes are taken along so many directions at a time, so that one program is compiled
 LANES = 8  # combinations stepped together; a fixed number, so that the answer does not depend on the cores
+
+A = TypeVar("A")
+B = TypeVar("B")
 
 
 class Course(eqx.Module):
@@ -139,6 +143,15 @@ def _sensitivities(equations, integrator, course, zs, onehots, directions, rows,
     return jax.vmap(lane)(zs, onehots, directions, paths)
 
 
+# Arguments of `_sensitivities`, one call for every `DIRECTIONS` directions.
+_Run = list[tuple[Any, ...]]
+
+
+def _arrays(call: tuple[Any, ...]) -> tuple[np.ndarray, np.ndarray]:
+    shown, slopes = _sensitivities(*call)
+    return np.asarray(shown), np.asarray(slopes)
+
+
 @dataclass(frozen=True)
 class Predictions:
     """Readings of every lane over the first rows of one recording, and their slopes in its own unknowns."""
@@ -155,62 +168,86 @@ class Stepper:
         self.courses = courses(problem)
         self.no_path = jax.device_put(np.zeros((LANES, len(self.courses[0].times), problem.state)))
         self.jobs = jobs
+        self._pool, self._compiled = ThreadPoolExecutor(max(1, jobs)), False
 
     def on(self, problem: Problem) -> "Stepper":
         """The same for a problem over the same courses, which differs in which readings count or what bounds values."""
         other = Stepper.__new__(Stepper)
-        other.problem, other.courses, other.no_path, other.jobs = problem, self.courses, self.no_path, self.jobs
+        other.problem, other.courses, other.no_path = problem, self.courses, self.no_path
+        other.jobs, other._pool, other._compiled = self.jobs, self._pool, self._compiled
         return other
 
     def predict(
         self, zs: Float[np.ndarray, "lane z"], combinations: Sequence[Combination], rows: Sequence[int]
     ) -> list[Predictions]:
         """Predictions by recording, over its first `rows[r]` rows."""
-        alike = np.argsort([_costly(self.problem, c) for c in combinations], kind="stable")
+        p, alike = self.problem, np.argsort([_costly(self.problem, c) for c in combinations], kind="stable")
         chunks = [alike[a : a + LANES] for a in range(0, len(zs), LANES)]
-        work = [(r, chunk) for r in range(len(self.courses)) for chunk in chunks]
-        with ThreadPoolExecutor(max(1, self.jobs)) as pool:
-            parts = list(pool.map(lambda w: self._chunk(zs, combinations, rows[w[0]], *w), work))
+        work, runs = [], []
+        for r in range(len(self.courses)):
+            for chunk in chunks:
+                local, some = p.local(r), [combinations[k] for k in chunk]
+                free = [np.nonzero(p.active(c)[local])[0] for c in some]
+                hots = np.stack([p.onehot(c, r) for c in some])
+                work.append((r, free))
+                runs.append(self._run(r, zs[chunk][:, local], hots, free, rows[r]))
+        parts = [self._spread(*one, *found, rows) for one, found in zip(work, self._stepped(runs), strict=True)]
         back = np.argsort(alike)
         return [_joined(parts[r * len(chunks) : (r + 1) * len(chunks)], back) for r in range(len(self.courses))]
 
-    def _chunk(
-        self, zs: np.ndarray, combinations: Sequence[Combination], rows: int, r: int, chunk: np.ndarray
+    def _spread(
+        self, r: int, free: Sequence[np.ndarray], shown: np.ndarray, along: np.ndarray, rows: Sequence[int]
     ) -> Predictions:
-        p = self.problem
-        local, some = p.local(r), [combinations[k] for k in chunk]
-        free = [np.nonzero(p.active(c)[local])[0] for c in some]
-        hots = np.stack([p.onehot(c, r) for c in some])
-        out, along = self._run(r, zs[chunk][:, local], hots, free, rows)
-        slopes = np.zeros((len(some), len(local), rows, p.channels))
+        """Predictions of some lanes whose slopes are known along their `free` entries."""
+        p, number = self.problem, len(free)
+        slopes = np.zeros((number, len(p.local(r)), rows[r], p.channels))
         for lane, places in enumerate(free):
-            slopes[lane, places] = along[lane, : len(places), :rows, : p.channels]
-        return Predictions(out[:, :rows, : p.channels], slopes)
+            slopes[lane, places] = along[lane, : len(places), : rows[r], : p.channels]
+        return Predictions(shown[:number, : rows[r], : p.channels], slopes)
 
     def _run(
         self, r: int, local_z: np.ndarray, hots: np.ndarray, along: Sequence[np.ndarray], rows: int,
         paths: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        """Readings and phase points of at most `LANES` lanes and their slopes along the entries that `along` names;
-        with `paths` every row begins anew at its own."""
+    ) -> _Run:  # fmt: skip
+        """What yields readings and phase points of at most `LANES` lanes and their slopes along the entries that
+        `along` names; with `paths` every row begins anew at its own."""
         number, p = len(local_z), self.problem
         lanes = np.arange(LANES) % number
         width = -(-max(1, *map(len, along)) // DIRECTIONS) * DIRECTIONS
         directions = np.zeros((number, width, local_z.shape[1]))
         for lane, places in enumerate(along):
             directions[lane, np.arange(len(places)), places] = 1.0
-        some, matrices, along_some = (jax.device_put(a[lanes]) for a in (local_z, hots, directions))
+        some, matrices = (jax.device_put(a[lanes]) for a in (local_z, hots))
         last, switches, anew = jnp.asarray(rows), switches_of(p, r, hots), jnp.asarray(paths is not None)
         begun = self.no_path if paths is None else jax.device_put(paths[lanes])
-        parts = [
-            _sensitivities(
-                p.equations, p.integrator, self.courses[r], some, matrices, along_some[:, k : k + DIRECTIONS],
-                last, switches, begun, anew,
+        return [
+            (
+                p.equations, p.integrator, self.courses[r], some, matrices,
+                jax.device_put(directions[lanes, k : k + DIRECTIONS]), last, switches, begun, anew,
             )
             for k in range(0, width, DIRECTIONS)
         ]  # fmt: skip
-        slopes = np.concatenate([np.asarray(one) for _, one in parts], axis=1)
-        return np.asarray(parts[0][0])[:number], slopes[:number]
+
+    def _stepped(self, runs: Sequence[_Run]) -> list[tuple[np.ndarray, np.ndarray]]:
+        """What runs yield, of `LANES` lanes each: side by side on all threads, which wait for nothing but these.
+
+        The very first goes before, or every thread would compile it.
+        """
+        calls = [call for run in runs for call in run]
+        alone = [] if self._compiled else [_arrays(calls.pop(0))]
+        self._compiled = True
+        side_by_side = self.jobs > 1 and len(calls) > 1
+        done = chain(alone, self._pool.map(_arrays, calls) if side_by_side else map(_arrays, calls))
+        found = [[next(done) for _ in run] for run in runs]
+        return [(parts[0][0], np.concatenate([slopes for _, slopes in parts], axis=1)) for parts in found]
+
+    def ahead(self, work: Callable[[A], B], items: Sequence[A]) -> Iterator[B]:
+        """The work on every item in order, on all threads while what comes before is being used."""
+        if self.jobs < 2 or len(items) < 2:
+            yield from map(work, items)
+            return
+        with ThreadPoolExecutor(self.jobs) as pool:
+            yield from pool.map(work, items)
 
     def responses(
         self, z: Float[np.ndarray, " z"], combination: Combination, laid: Sequence[Any], rows: int, r: int
@@ -225,7 +262,7 @@ class Stepper:
         for _, matrix, amplitudes in laid:
             unseen = [p.equations.width - 1, 2 * p.equations.width - 1] if matrix[-1].any() else []
             along.append(np.concatenate([unseen, self._further + np.concatenate(amplitudes)]).astype(int))
-        _, slopes = self._run(r, some, hots, along, rows)
+        ((_, slopes),) = self._stepped([self._run(r, some, hots, along, rows)])
         out = []
         for lane, places in enumerate(along):
             full = np.zeros((len(local), rows, p.channels))
@@ -248,13 +285,10 @@ class Stepper:
         some, hots = self._beside(lanes, r)
         start = np.arange(self.problem.state)
         along = [self._further + np.concatenate(one[2]) if one[2] else start for _, _, one in lanes]
-        found = []
-        for a in range(0, len(along), LANES):
-            few = slice(a, a + LANES)
-            shown, slopes = self._run(r, some[few], hots[few], along[few], rows)
-            found += [(x[:rows], own[: len(places), :rows])
-                      for x, own, places in zip(shown, slopes, along[few], strict=True)]  # fmt: skip
-        return found
+        parts = [slice(a, a + LANES) for a in range(0, len(along), LANES)]
+        done = self._stepped([self._run(r, some[few], hots[few], along[few], rows) for few in parts])
+        return [(x[:rows], own[: len(places), :rows]) for few, found in zip(parts, done, strict=True)
+                for x, own, places in zip(*found, along[few], strict=False)]  # fmt: skip
 
     def about_paths(
         self, paths: Float[np.ndarray, "lane time state"], values: Float[np.ndarray, "lane theta"], hots: np.ndarray,
@@ -270,11 +304,11 @@ class Stepper:
         whole = np.zeros((lanes, len(self.courses[r].times), state))
         whole[:, :rows] = paths
         along = [np.concatenate([p.moving(hot[-1]), self._further + own]) for hot, own in zip(hots, slots, strict=True)]
-        out, found = self._run(r, local_z, hots, along, rows, whole)
+        ((out, found),) = self._stepped([self._run(r, local_z, hots, along, rows, whole)])
         slopes = np.zeros((lanes, local_z.shape[1], rows, out.shape[-1]))
         for lane, places in enumerate(along):
             slopes[lane, places] = found[lane, : len(places), :rows]
-        return out[:, :rows], slopes
+        return out[:lanes, :rows], slopes
 
     @property
     def _further(self) -> int:
