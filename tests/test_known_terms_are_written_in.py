@@ -10,9 +10,10 @@ from symplearn._errors import InputError
 from symplearn.diagnosis import Restriction
 from symplearn.diagnosis._build import augmented_equations, build
 from symplearn.diagnosis._calibrate import grow
+from symplearn.diagnosis._course import courses
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._stochastic import free_run
-from symplearn.diagnosis._trajectory import Stepper, courses
+from symplearn.diagnosis._trajectory import Stepper
 
 TIMES = np.linspace(2.0, 8.0, 121)
 START = np.array([0.7, -0.4, 0.3, 0.5])

@@ -19,9 +19,9 @@ from .._symbolic import TooLarge
 from .._terms import mechanics, noise_factor
 from .._thinning import highest_frequency
 from .._vocabulary import PARAMETER
+from ._course import courses
 from ._problem import Calibrated, Combination, InitialPrior, Problem
 from ._stochastic import free_run
-from ._trajectory import courses
 
 # Substeps per shortest period of the motion to begin with; the search refines it by doubling.
 SUBSTEPS = 8

@@ -16,12 +16,13 @@ from .._recording import Recording
 from .._rows import spans_between
 from .._triangular import semidefinite_cholesky
 from ._bend import bent
+from ._course import effect_coefficients, model_at
 from ._outlook import colour_ratio, intensity_of, start_spread, total_noise
 from ._problem import Problem
 from ._record import Forecast
 from ._stochastic import exposure, filter_lane, padded, row_roots, run_lane, softness
 from ._taught import root_of, taught
-from ._trajectory import Stepper, effect_coefficients, model_at
+from ._trajectory import Stepper
 from ._weighed import Estimate
 
 _DRAWS = 128

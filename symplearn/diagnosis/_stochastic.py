@@ -16,9 +16,10 @@ from .._filter import Filtered, unscented_filter
 from .._model import Gaussian, StateSpaceModel
 from .._smoother import Smoothed, smooth_along
 from ._calibrate import THINNED
+from ._course import Course, model_at
 from ._path import Linear, linearise
 from ._problem import SLOTS, Combination, Problem
-from ._trajectory import Course, Stepper, model_at
+from ._trajectory import Stepper
 
 
 class MissingForce(eqx.Module):
