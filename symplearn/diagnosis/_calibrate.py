@@ -18,8 +18,13 @@ _FLOOR = 1e-9
 _FLAT = 1e-13
 # Of minus twice the log posterior: what a fit may still promise that is as good as done.
 _SLIGHT = 1.0
-# After this many steps a lane that lies this many nats behind the best is no longer improved.
+# After this many steps a lane that lies this many nats behind the best is no longer improved, unless it comes nearer by
+# this share in so many of them.
 _PATIENCE, _HOPELESS = 6, 500.0
+_NEARER, _LATELY = 0.7, 3
+# After this many steps a lane that promises less than this is in a valley, which its steps are bent along: by what readings
+# show at this share of a step, where that turns it by less than this share.
+_SLOW, _VALLEY, _PROBE, _TURN = 12, 100.0, 0.1, 0.75
 
 
 @dataclass(frozen=True)
@@ -169,7 +174,7 @@ def calibrate(
         active[held, problem.slots :] = False
     fits = _evaluated(stepper, np.array(start, float), list(combinations), rows, weight)
     damping, done, stuck = np.full(lanes, 1e-3), np.zeros(lanes, bool), np.zeros(lanes, bool)
-    left = np.full(lanes, np.inf)
+    left, behind = np.full(lanes, np.inf), list[Float[np.ndarray, " lane"]]()
     fits = _costed(problem, fits, weight, precision, mean)
     for count in range(iterations):
         some = np.nonzero(~done)[0]  # lanes that have converged are not stepped again
@@ -177,11 +182,15 @@ def calibrate(
             break
         mine = _chosen(fits, some)
         given = precision[some], mean[some], active[some], bounds[some], damping[some]
-        step, promised = _steps(problem, mine, weight, *given)
+        step, promised, inverse = _steps(problem, mine, weight, *given)
         left[some], done[some] = promised, promised < tolerance
         if done.all():
             break
-        some, mine, step = some[~done[some]], _chosen(mine, ~done[some]), step[~done[some]]
+        left_over = ~done[some]
+        some, mine, step, inverse = some[left_over], _chosen(mine, left_over), step[left_over], inverse[left_over]
+        low = left[some] < _VALLEY
+        if count >= _SLOW and low.any():
+            step[low] += _turn(stepper, _chosen(mine, low), rows, weight, step[low], inverse[low])
         moved = np.clip(mine.z + step, bounds[some, 0], bounds[some, 1])
         trial = replace(_evaluated(stepper, moved, mine.combinations, rows, weight), noise=mine.noise)
         trial = _costed(problem, trial, weight, precision[some], mean[some])
@@ -195,10 +204,11 @@ def calibrate(
         damping[some] = np.clip(np.where(better, damping[some] / 10, damping[some] * 5), 1e-9, 1e12)
         stuck |= damping > 1e8
         done |= stuck
+        value = fits.cost + 2 * _log_noise(problem, fits.noise, weight)
+        behind.append(value - np.min(np.where(np.isnan(value), np.inf, value)))
         if count >= _PATIENCE:
-            value = fits.cost + 2 * _log_noise(problem, fits.noise, weight)
-            best = np.min(np.where(np.isnan(value), np.inf, value))
-            stuck |= ~done & (value > best + 2 * _HOPELESS)
+            nearer = behind[-1] < _NEARER * behind[-1 - _LATELY]
+            stuck |= ~done & (behind[-1] > 2 * _HOPELESS) & ~nearer
             done |= stuck
     return replace(fits, converged=(done & ~stuck | (left < _SLIGHT)) & np.isfinite(fits.cost))
 
@@ -278,14 +288,37 @@ def noise_roots(weight: Sequence[np.ndarray], fits: Fits) -> list[Float[np.ndarr
     return [np.where(w > 0, np.sqrt(w), 0.0) / fits.noise[0] for w in weight]
 
 
-def _steps(problem, fits: Fits, weight, precision, mean, active, bounds, damping) -> tuple[np.ndarray, np.ndarray]:
-    """Damped Gauss-Newton steps, and what an undamped one promises to take off the cost."""
+def _turn(
+    stepper: Stepper, fits: Fits, rows: Sequence[int], weight: list[np.ndarray], step: np.ndarray, inverse: np.ndarray
+) -> Float[np.ndarray, "lane z"]:
+    """What a step has to turn to follow a curved valley: half its geodesic acceleration (Transtrum and Sethna 2012);
+    nothing where that is large beside the step."""
+    problem, push = stepper.problem, np.zeros_like(step)
+    ahead = stepper.predict(fits.z + _PROBE * step, fits.combinations, rows)
+    both = zip(residuals(problem, fits.predictions, weight), residuals(problem, ahead, weight), strict=True)
+    with np.errstate(all="ignore"):  # a probe may run away
+        for r, (here, there) in enumerate(both):
+            place, slopes = problem.local(r), fits.predictions[r].slopes
+            straight = np.einsum("bztj,bz->btj", slopes, step[:, place])
+            bend = 2.0 / _PROBE**2 * (there - here + _PROBE * straight) * weight[r] / fits.noise[:, None] ** 2
+            push[:, place] += np.einsum("bztj,btj->bz", slopes, bend)
+        turn = np.einsum("bxz,bz->bx", inverse, push)
+        unit = np.sqrt(np.maximum(np.diagonal(inverse, axis1=1, axis2=2), 1e-300))
+        small = np.linalg.norm(turn / unit, axis=1) < _TURN * np.linalg.norm(step / unit, axis=1)
+    return np.where(small[:, None], 0.5 * turn, 0.0)
+
+
+def _steps(
+    problem, fits: Fits, weight, precision, mean, active, bounds, damping
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Damped Gauss-Newton steps, what an undamped one promises to take off the cost, and the inverse that damps them."""
     with np.errstate(over="ignore", invalid="ignore"):
         matrix, vector = normal_equations(problem, fits, weight)
     vector = vector - precision * (fits.z - mean)
     # What stands at a bound and is pushed against it stays there.
     active = active & ~((fits.z <= bounds[:, 0]) & (vector < 0)) & ~((fits.z >= bounds[:, 1]) & (vector > 0))
     steps, promised = np.zeros_like(fits.z), np.full(len(fits.z), np.inf)
+    inverse = np.zeros_like(matrix)
     for b in range(len(steps)):
         a = np.nonzero(active[b])[0]
         square = matrix[b][np.ix_(a, a)] + np.diag(precision[b][a])
@@ -295,6 +328,7 @@ def _steps(problem, fits: Fits, weight, precision, mean, active, bounds, damping
         values, vectors = np.linalg.eigh(square / np.outer(scale, scale))
         values = np.maximum(values, _FLAT * values[-1])
         along = vectors.T @ (vector[b, a] / scale)
-        steps[b, a] = vectors @ (along / (values + damping[b])) / scale
+        inverse[b][np.ix_(a, a)] = (vectors / (values + damping[b])) @ vectors.T / np.outer(scale, scale)
+        steps[b] = inverse[b][:, a] @ vector[b, a]
         promised[b] = float((along**2 / values).sum())
-    return steps, promised
+    return steps, promised, inverse

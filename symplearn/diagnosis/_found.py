@@ -80,7 +80,10 @@ class Found:
     ahead: dict[Combination, Ahead] = field(default_factory=dict)  # of the likeliest, beside a clear remainder
 
     def add(self, estimate: Estimate) -> None:
-        """Keep an estimate beside those of the same combination and kind, as a mode where it stands apart."""
+        """Keep an estimate beside those of the same combination and kind, as a mode where it stands apart; one whose
+        trajectory ran away, without a number for its evidence, is as unlikely as can be."""
+        if np.isnan(estimate.log_evidence):
+            estimate = replace(estimate, log_evidence=-np.inf)
         kinds = self.estimates.setdefault(estimate.combination, [])
         old = self.of(estimate.combination, estimate.kind)
         if old is None:
