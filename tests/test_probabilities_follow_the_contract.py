@@ -86,6 +86,19 @@ def price(problem, candidate):
     return 1 / (FAMILIES * len(EFFECTS[one.family]) * targets)
 
 
+def test_what_has_no_number_for_its_evidence_takes_nothing_from_the_others(problem):
+    """A fit that ran away, kept before all others, has no probability and leaves theirs as they are."""
+    lost, *some = singles(problem)[:4]
+    others = [one for k, c in enumerate(some) for one in alike(problem, c, 10.0 + k)]
+    base = [*alike(problem, (), 0.0), *others]
+    without = posterior(problem, found(problem, *base, *alike(problem, lost, -np.inf)), 1.0)
+    beside = posterior(problem, found(problem, *alike(problem, lost, np.nan), *base), 1.0)
+    told = {one.combination: one.probability for one in beside.named}
+    assert told.get(lost, 0.0) == 0.0
+    assert max(told, key=told.get) == some[-1]
+    assert told == pytest.approx({one.combination: one.probability for one in without.named}, abs=1e-12)
+
+
 def test_every_effect_on_every_target_is_in_the_vocabulary(problem):
     """Two coordinates, their pair, a parameter and two columns, each once with each effect; a stop once by side. Beside
     it two powers of each coordinate that shape a force without a name, and are never looked for."""

@@ -68,6 +68,27 @@ def test_what_may_do_as_well_is_weighed(damped):
     assert any(rival in damped.found.estimates for rival in rivals)
 
 
+@pytest.mark.slow
+def test_what_is_left_of_a_triple_is_weighed_down_to_one(damped):
+    """Of three effects of which two do nothing, the one that acts is weighed by itself, though neither it nor any pair
+    was before."""
+    damping, before = (member(damped, "viscous_damping"),), dict(damped.found.estimates)
+    white = damped.found.of(damping, "white")
+    triple = tuple(sorted((*damping, member(damped, "quadratic_stiffness"), member(damped, "cubic_stiffness"))))
+    start = np.zeros_like(white.z)
+    start[: damped.problem.slots] = white.z[: damped.problem.slots]
+    for m, place in damped.problem.placed(triple):
+        start[place] = white.z[dict(damped.problem.placed(damping))[m]] if m in damping else 0.0
+    for c in [c for c in damped.found.estimates if c]:
+        del damped.found.estimates[c]
+    damped.weigher.weigh([Start(triple, start, 0.0)], whole=True)
+    Refinement(damped.prospects, damped.progress).weigh_subsets()
+    assert damped.found.of(damping, "white").log_evidence == pytest.approx(white.log_evidence, abs=0.01)
+    assert damped.found.best(damping) > damped.found.best(triple)
+    damped.found.estimates.clear()
+    damped.found.estimates.update(before)
+
+
 def test_a_path_that_was_thrown_out_sets_no_scale():
     """A path that has not settled and leads a thousand times as far as the motion is passed over for the best
     trajectory; one that has settled is not."""

@@ -22,8 +22,8 @@ _SLIGHT = 1.0
 # this share in so many of them.
 _PATIENCE, _HOPELESS = 6, 500.0
 _NEARER, _LATELY = 0.7, 3
-# After this many steps a lane that promises less than this is in a valley, which its steps are bent along: by what readings
-# show at this share of a step, where that turns it by less than this share.
+# After this many steps a lane that promises less than this is in a valley, which its steps are bent along: by what
+# readings show at this share of a step, where that turns it by less than this share.
 _SLOW, _VALLEY, _PROBE, _TURN = 12, 100.0, 0.1, 0.75
 
 
@@ -207,10 +207,16 @@ def calibrate(
         value = fits.cost + 2 * _log_noise(problem, fits.noise, weight)
         behind.append(value - np.min(np.where(np.isnan(value), np.inf, value)))
         if count >= _PATIENCE:
-            nearer = behind[-1] < _NEARER * behind[-1 - _LATELY]
-            stuck |= ~done & (behind[-1] > 2 * _HOPELESS) & ~nearer
+            stuck |= ~done & is_hopeless(behind)
             done |= stuck
     return replace(fits, converged=(done & ~stuck | (left < _SLIGHT)) & np.isfinite(fits.cost))
+
+
+def is_hopeless(behind: Sequence[Float[np.ndarray, " lane"]]) -> Bool[np.ndarray, " lane"]:
+    """Lanes that lie far behind the best and do not come nearer, by how much minus twice the log posterior was larger
+    after every step."""
+    nearer = behind[-1] < _NEARER * behind[-1 - _LATELY]
+    return (behind[-1] > 2 * _HOPELESS) & ~nearer
 
 
 def _chosen(fits: Fits, lanes: np.ndarray) -> Fits:
@@ -311,7 +317,7 @@ def _turn(
 def _steps(
     problem, fits: Fits, weight, precision, mean, active, bounds, damping
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Damped Gauss-Newton steps, what an undamped one promises to take off the cost, and the inverse that damps them."""
+    """Damped Gauss-Newton steps, what an undamped one promises to take off the cost, and the damped inverse."""
     with np.errstate(over="ignore", invalid="ignore"):
         matrix, vector = normal_equations(problem, fits, weight)
     vector = vector - precision * (fits.z - mean)
