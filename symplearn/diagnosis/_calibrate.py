@@ -18,7 +18,7 @@ _FLOOR = 1e-9
 _FLAT = 1e-13
 # Of minus twice the log posterior: what a fit may still promise that is as good as done.
 _SLIGHT = 1.0
-# After this many steps a lane that lies this many nats behind the best is no longer improved, unless it comes nearer by
+# After this many steps a lane that lies this many nats behind the best is no longer improved, unless that has fallen to
 # this share in so many of them.
 _PATIENCE, _HOPELESS = 6, 500.0
 _NEARER, _LATELY = 0.7, 3
