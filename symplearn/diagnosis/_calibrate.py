@@ -188,7 +188,7 @@ def calibrate(
             break
         left_over = ~done[some]
         some, mine, step, inverse = some[left_over], _chosen(mine, left_over), step[left_over], inverse[left_over]
-        low = left[some] < _VALLEY
+        low = (left[some] > _SLIGHT) & (left[some] < _VALLEY)
         if count >= _SLOW and low.any():
             step[low] += _turn(stepper, _chosen(mine, low), rows, weight, step[low], inverse[low])
         moved = np.clip(mine.z + step, bounds[some, 0], bounds[some, 1])
