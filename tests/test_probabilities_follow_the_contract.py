@@ -96,6 +96,7 @@ def test_what_has_no_number_for_its_evidence_takes_nothing_from_the_others(probl
     told = {one.combination: one.probability for one in beside.named}
     assert told.get(lost, 0.0) == 0.0
     assert max(told, key=told.get) == some[-1]
+    # Round-off: the sums run in another order.
     assert told == pytest.approx({one.combination: one.probability for one in without.named}, abs=1e-12)
 
 

@@ -110,7 +110,7 @@ def test_of_many_each_gains_what_it_gains_by_itself(lowest, alone):
     for own in (np.zeros(2, int), np.arange(2)):
         each = [mixture_gain(*one, own, bounds, alone) for one in some]
         many = mixture_gains(*map(np.stack, zip(*some, strict=True)), own, bounds, alone)
-        np.testing.assert_allclose(many, each, rtol=1e-12)
+        np.testing.assert_allclose(many, each, rtol=1e-12)  # round-off of other products
         assert (np.abs(many[:3]) > 0.01).all() and (many[3:] == 0.0).all()
 
 

@@ -83,6 +83,7 @@ def test_what_is_left_of_a_triple_is_weighed_down_to_one(damped):
         del damped.found.estimates[c]
     damped.weigher.weigh([Start(triple, start, 0.0)], whole=True)
     Refinement(damped.prospects, damped.progress).weigh_subsets()
+    # A fit ends where it promises a thousandth; a hundredth of a nat changes no probability.
     assert damped.found.of(damping, "white").log_evidence == pytest.approx(white.log_evidence, abs=0.01)
     assert damped.found.best(damping) > damped.found.best(triple)
     damped.found.estimates.clear()

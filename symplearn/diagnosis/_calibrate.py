@@ -22,8 +22,8 @@ _SLIGHT = 1.0
 # this share in so many of them.
 _PATIENCE, _HOPELESS = 6, 500.0
 _NEARER, _LATELY = 0.7, 3
-# After this many steps a lane that promises less than this is in a valley, which its steps are bent along: by what
-# readings show at this share of a step, where that turns it by less than this share.
+# After this many steps a lane that promises less than this, yet more than a fit that is done may, is in a valley, which
+# its steps are bent along: by what readings show at this share of a step, where that turns it by less than this share.
 _SLOW, _VALLEY, _PROBE, _TURN = 12, 100.0, 0.1, 0.75
 
 
@@ -188,9 +188,9 @@ def calibrate(
             break
         left_over = ~done[some]
         some, mine, step, inverse = some[left_over], _chosen(mine, left_over), step[left_over], inverse[left_over]
-        low = (left[some] > _SLIGHT) & (left[some] < _VALLEY)
-        if count >= _SLOW and low.any():
-            step[low] += _turn(stepper, _chosen(mine, low), rows, weight, step[low], inverse[low])
+        valley = (left[some] > _SLIGHT) & (left[some] < _VALLEY)
+        if count >= _SLOW and valley.any():
+            step[valley] += _turn(stepper, _chosen(mine, valley), rows, weight, step[valley], inverse[valley])
         moved = np.clip(mine.z + step, bounds[some, 0], bounds[some, 1])
         trial = replace(_evaluated(stepper, moved, mine.combinations, rows, weight), noise=mine.noise)
         trial = _costed(problem, trial, weight, precision[some], mean[some])
@@ -335,6 +335,6 @@ def _steps(
         values = np.maximum(values, _FLAT * values[-1])
         along = vectors.T @ (vector[b, a] / scale)
         inverse[b][np.ix_(a, a)] = (vectors / (values + damping[b])) @ vectors.T / np.outer(scale, scale)
-        steps[b] = inverse[b][:, a] @ vector[b, a]
+        steps[b, a] = vectors @ (along / (values + damping[b])) / scale
         promised[b] = float((along**2 / values).sum())
     return steps, promised, inverse

@@ -1,7 +1,6 @@
 """Fits with a missing force of given intensity: paths and unknowns together, many combinations at once."""
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import jax
@@ -58,9 +57,8 @@ def fit_paths(
 ) -> list[PathFit]:
     """Gauss-Newton on paths and unknowns from given starts, `LANES` of them at a time."""
     chunks = [list(starts[a : a + LANES]) for a in range(0, len(starts), LANES)]
-    with ThreadPoolExecutor(max(1, stepper.jobs)) as pool:
-        done = pool.map(lambda chunk: _fit_chunk(stepper, chunk, priors, rows, iterations), chunks)
-        return [fit for chunk in done for fit in chunk]
+    done = stepper.ahead(lambda chunk: _fit_chunk(stepper, chunk, priors, rows, iterations), chunks)
+    return [fit for chunk in done for fit in chunk]
 
 
 @np.errstate(all="ignore")  # a lane that diverged is told by its evidence

@@ -111,15 +111,15 @@ class Refinement:
         """What the best combinations become without each of their members, from where they are, and what becomes of
         those: what was weighed already may have been caught in a poorer optimum, which would make the member look
         needed."""
-        tried: set[Combination] = set()
+        tried, base = set[Combination](), self.weigher.base
         for _ in range(MOST - 1):
             ranked = sorted(filter(self._is_worth_it, self.found.estimates), key=self.found.best, reverse=True)[:KEPT]
-            less = dict.fromkeys(c[:k] + c[k + 1 :] for c in ranked for k in range(len(c)) if c[k] not in
-                                 self.weigher.base)  # fmt: skip
+            less = dict.fromkeys(c[:k] + c[k + 1 :] for c in ranked for k in range(len(c)) if c[k] not in base)
             some = [c for c in less if c and c not in tried
                     and (c not in self.found.estimates or self._is_behind(c, ranked))][: 2 * KEPT]  # fmt: skip
-            if some:
-                self.weigher.weigh([Start(c, self._shrunk(c, ranked), 0.0) for c in some], whole=True)
+            if not some:
+                break
+            self.weigher.weigh([Start(c, self._shrunk(c, ranked), 0.0) for c in some], whole=True)
             tried.update(some)
 
     def _mine(self) -> list[Combination]:
