@@ -162,7 +162,8 @@ def calibrate(
 
     A lane has converged when an undamped step promises less than `tolerance` of minus twice the log posterior; where
     the steps end before, as they do where none keeps what it promises, about a threshold that passes a reading, less
-    than `_SLIGHT`. The values of effects do not move in lanes that are `held`.
+    than `_SLIGHT` lately: either side of such a kink promises another step. The values of effects do not move in lanes
+    that are `held`.
     """
     problem, lanes = stepper.problem, len(start)
     weight = weights(problem, rows)
@@ -174,7 +175,8 @@ def calibrate(
         active[held, problem.slots :] = False
     fits = _evaluated(stepper, np.array(start, float), list(combinations), rows, weight)
     damping, done, stuck = np.full(lanes, 1e-3), np.zeros(lanes, bool), np.zeros(lanes, bool)
-    left, behind = np.full(lanes, np.inf), list[Float[np.ndarray, " lane"]]()
+    left = np.full(lanes, np.inf)
+    behind, lately = list[Float[np.ndarray, " lane"]](), list[Float[np.ndarray, " lane"]]()
     fits = _costed(problem, fits, weight, precision, mean)
     for count in range(iterations):
         some = np.nonzero(~done)[0]  # lanes that have converged are not stepped again
@@ -184,6 +186,7 @@ def calibrate(
         given = precision[some], mean[some], active[some], bounds[some], damping[some]
         step, promised, inverse = _steps(problem, mine, weight, *given)
         left[some], done[some] = promised, promised < tolerance
+        lately = [*lately[1 - _LATELY :], left.copy()]
         if done.all():
             break
         left_over = ~done[some]
@@ -209,7 +212,8 @@ def calibrate(
         if count >= _PATIENCE:
             stuck |= ~done & is_hopeless(behind)
             done |= stuck
-    return replace(fits, converged=(done & ~stuck | (left < _SLIGHT)) & np.isfinite(fits.cost))
+    rests = np.min(lately, axis=0, initial=np.inf) < _SLIGHT
+    return replace(fits, converged=(done & ~stuck | rests) & np.isfinite(fits.cost))
 
 
 def is_hopeless(behind: Sequence[Float[np.ndarray, " lane"]]) -> Bool[np.ndarray, " lane"]:
