@@ -2,8 +2,9 @@
 
 It gives each coefficient's interval, the held-out and the forecast error, and whether the truth can be named at all:
 its form must beat nothing by 14 and every rival of its size by 6 in BIC. Rivals of a single effect are all words on all
-targets, ranked by their linear response; the closest are fitted in full. Rivals of a pair exchange one member by every
-other effect. A remainder is known to the oracle, and noise has its true standard deviation.
+targets, ranked by the BIC that their linear response promises; the closest are fitted in full. Rivals of a pair
+exchange one member by every other effect. A remainder is known to the oracle, and noise has its true standard
+deviation.
 """
 
 import csv
@@ -23,18 +24,17 @@ from ._concealed_files import read_effects, read_setup
 from ._concealed_fit import Fitted, Form, Given, fit
 from ._concealed_hiding import form_of, starts, weights
 from ._concealed_likelihoods import NOISY, noise_margins, noise_widths, without_outliers
-from ._concealed_rivals import candidates, physical, ranked
+from ._concealed_rivals import candidates, open_names, physical, ranked
 from ._concealed_seal import put
 from ._concealed_sensors import Setup
 
 NOTHING, OTHERS = 14.0, 6.0
-FITTED = 4  # rivals that are fitted in full, for each member
-VERSION = 4  # what was kept by another is computed again
+FITTED = 8  # rivals that are fitted in full, for each member: the ranks of linear responses are not exact
+VERSION = 5  # what was kept by another is computed again
 HELD_OUT = 0.25
 EDGE = 0.05  # part of the recording at either end in which a rival's jump does not count
 # A rival that leaves more chi-square, and a larger part of it, than this by its linear response is not fitted.
 FAR_OFF = (100.0, 0.25)
-_CLOSED = ("side", "z_0", "w_0", "t_on", "t_off")
 
 
 def asked(path: Path, answer: dict[str, Any], public_folder: Path) -> dict[str, Any]:
@@ -90,12 +90,7 @@ def consulted(answer: dict[str, Any], seen: tuple[np.ndarray, ...]) -> dict[str,
 
 def _opened(form: Form, moving: int) -> Form:
     """All coefficients of the true effects free."""
-    pairs = [
-        (k, name)
-        for k, e in enumerate(form.effects[:moving])
-        for name, value in e.values.items()
-        if name not in _CLOSED and isinstance(value, float)
-    ]
+    pairs = [(k, name) for k, e in enumerate(form.effects[:moving]) for name in open_names(e)]
     return replace(form, open=tuple(pairs))
 
 

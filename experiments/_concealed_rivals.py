@@ -34,8 +34,15 @@ class Rival(NamedTuple):
     effect: Effect
     left: float
     part: float  # of the chi-square
+    price: float  # of its coefficients, by BIC
+
+    @property
+    def behind(self) -> float:
+        """What its BIC will be about, less what is common to all."""
+        return self.left + self.price
 
 
+_CLOSED = ("side", "z_0", "w_0", "t_on", "t_off")
 # Only a positive strength is what these words mean.
 POSITIVE = ("viscous_damping", "quadratic_drag", "coulomb_friction", "relative_damping", "self_excitation",
             "hidden_oscillator", "sensor_delay", "contact_stop")  # fmt: skip
@@ -44,6 +51,11 @@ POSITIVE = ("viscous_damping", "quadratic_drag", "coulomb_friction", "relative_d
 def physical(effect: Effect) -> bool:
     """Whether an effect's strength has the sign that its word asks for."""
     return effect.word not in POSITIVE or effect.values[effect.strength] > 0
+
+
+def open_names(effect: Effect) -> list[str]:
+    """The coefficients that a fit is free in."""
+    return [name for name, value in effect.values.items() if name not in _CLOSED and isinstance(value, float)]
 
 
 def candidates(setup: Setup, public: Public, recordings: tuple[int, ...]) -> list[Candidate]:
@@ -205,6 +217,7 @@ def ranked(form: Form, public: Public, kept: Sequence[Effect], truth: Effect, fo
     basis = nuisances(setup, public)
     spans = [e for c in found for e in c.span]
     whole = responses(setup, public, [truth, *kept, *spans])
+    price = float(np.log(len(whole)))
     whole = np.concatenate([whole, np.zeros((len(basis) - len(whole), whole.shape[1]))])
     whole = np.where(np.isfinite(whole), whole, 0.0)
     whole = whole - basis @ (basis.T @ whole)
@@ -217,10 +230,16 @@ def ranked(form: Form, public: Public, kept: Sequence[Effect], truth: Effect, fo
         place += len(c.span)
         weight, *_ = np.linalg.lstsq(columns, goal, rcond=1e-8)
         left, whole_goal = float(np.sum((goal - columns @ weight) ** 2)), max(float(np.sum(goal**2)), 1e-300)
-        rival = Rival(_with_strength(c, weight), left, left / whole_goal)
+        rival = Rival(_with_strength(c, weight), left, left / whole_goal, price * _freedom(setup, c.effect))
         if physical(rival.effect) and (c.effect.key not in best or left < best[c.effect.key].left):
             best[c.effect.key] = rival
-    return sorted(best.values(), key=lambda r: r.left)
+    return sorted(best.values(), key=lambda r: r.behind)
+
+
+def _freedom(setup: Setup, effect: Effect) -> int:
+    """How many coefficients and hidden states an effect brings."""
+    hidden = 2 * len(setup.records) if effect.word == "hidden_oscillator" else 0
+    return len(open_names(effect)) + hidden
 
 
 def _with_strength(c: Candidate, weight: np.ndarray) -> Effect:

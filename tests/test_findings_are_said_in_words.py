@@ -4,11 +4,11 @@ import math
 import re
 
 import pytest
-from finding_cases import EVERY, MOMENTA, TARGETS, UNITS, VALUES, said
+from finding_cases import EVERY, MOMENTA, TARGETS, UNITS, VALUES, candidate, said
 
 from symplearn._vocabulary import VOCABULARY
 from symplearn.diagnosis._units import coefficient_units
-from symplearn.diagnosis._words import in_words
+from symplearn.diagnosis._words import finding_sentence, in_words
 
 
 @pytest.mark.parametrize(("name", "side"), EVERY)
@@ -77,6 +77,13 @@ def test_a_stop_acts_on_its_own_side():
     """The upper stop acts above its place, the lower one below."""
     assert "only while theta is above 0.7" in said("contact_stop", "upper")
     assert "only while theta is below -0.7" in said("contact_stop", "lower", a=-0.7)
+
+
+def test_a_coordinate_called_like_a_coefficient_is_no_coefficient():
+    """Of a stop on the coordinate `a` the place has an index in the law and beside it."""
+    one, numbers = candidate("contact_stop", "upper", ("a",)), {"sd": 0.1, "interval95": [0, 1]}
+    text = finding_sentence(one, {c: {"mean": VALUES[c], **numbers} for c in ("k", "a")}, None, {}, (), None)
+    assert "F = -k max(a - a_0, 0), where k = 2.5 +- 0.1 and a_0 = 0.7 +- 0.1" in text
 
 
 def test_rivals_are_plain_words():

@@ -70,8 +70,13 @@ def law_text(one: Candidate, coefficients: Mapping[str, Any]) -> str:
 
 
 def symbolic_law(one: Candidate) -> str:
-    """The law of one effect with the names of its coefficients, `F = -c v`."""
-    return _law(one, {name: name for name in one.effect.coefficients})
+    """The law of one effect with the symbols of its coefficients, `F = -c v`."""
+    return _law(one, symbols(one))
+
+
+def symbols(one: Candidate) -> dict[str, str]:
+    """What a law calls the coefficients of the contract: their names, with an index where a target is called so."""
+    return {name: f"{name}_0" if name in one.targets else name for name in one.effect.coefficients}
 
 
 def equation_lines(

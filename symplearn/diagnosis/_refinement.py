@@ -4,7 +4,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .._effects import HIDDEN
+from .._effects import HIDDEN, STOP
+from ._depths import along_the_depths
 from ._found import Found, speaker
 from ._modes import along_the_modes
 from ._problem import MOST, Combination, Problem
@@ -47,7 +48,10 @@ class Refinement:
             assert white is not None  # every combination is weighed under white noise first
             starts += [] if white.converged else [Start(c, white.z, 0.0)]
             for member, place in self.problem.placed(c) if k < _MOVED else []:
-                if self.problem.candidate(member).effect.places:
+                effect = self.problem.candidate(member).effect
+                if effect is STOP:
+                    starts += [Start(c, z, 0.0) for z in along_the_depths(self.weigher, c, white.z, member)]
+                elif effect.places:
                     starts += [Start(c, z, 0.0) for z in self._moved(white.z, member, place.stop - 1)]
         if starts:
             self.progress("moving times, thresholds and frequencies")

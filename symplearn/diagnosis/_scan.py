@@ -19,8 +19,10 @@ from ._problem import SLOTS, Combination, Problem
 from ._score import Nuisance, Response, Score, Start, Unit, nuisance, placed, response, scores
 from ._trajectory import DIRECTIONS, LANES, Stepper
 
-# Places tried for times and thresholds, and the most frequencies; frequencies this many times pi over the span apart.
-_TIMES, _THRESHOLDS, _FREQUENCIES, _SPACING = 60, 12, 160, 0.8
+# Places tried for times, and the most frequencies; frequencies this many times pi over the span apart.
+_TIMES, _FREQUENCIES, _SPACING = 60, 160, 0.8
+# How far inside the motion a stop is tried, as shares of the way from its edge to its middle.
+_DEPTHS = np.geomspace(0.01, 0.9, 12)
 # Starts kept for each effect and target, and for each choice of recordings.
 BEST = 3
 
@@ -41,15 +43,16 @@ def _places(one: Candidate, low: float, high: float) -> np.ndarray:
         # Evenly spaced as far as they go, which is what the span resolves; then ever wider.
         even = np.linspace(low, high, number)
         return even if high - low <= step * _FREQUENCIES else np.geomspace(low, high, number)
-    number = _THRESHOLDS if one.effect is effects.STOP else _TIMES
-    return low + (high - low) * (np.arange(number) + 0.5) / number
+    if one.effect is effects.STOP:
+        return high - (high - low) * _DEPTHS if one.side == "upper" else low + (high - low) * _DEPTHS
+    return low + (high - low) * (np.arange(_TIMES) + 0.5) / _TIMES
 
 
 def spacing(one: Candidate, low: float, high: float) -> float:
-    """About how far apart neighbouring places are."""
+    """About how far apart neighbouring frequencies or times are."""
     if isinstance(one.effect, Oscillating) or one.effect is effects.HIDDEN:
         return _SPACING * low * (2 if one.effect is effects.HIDDEN else 1)
-    return (high - low) / (_THRESHOLDS if one.effect is effects.STOP else _TIMES)
+    return (high - low) / _TIMES
 
 
 def packed(problem: Problem, units: Sequence[Unit]) -> Iterator[list[Unit]]:

@@ -10,7 +10,7 @@ from .._vocabulary import PAIR, VOCABULARY
 from ._consequences import Said, consequence
 from ._law_text import equation_lines as equation_lines
 from ._law_text import law_text as law_text
-from ._law_text import symbolic_law
+from ._law_text import symbolic_law, symbols
 from ._next import next_measurement as next_measurement
 
 _OPENINGS = {
@@ -127,10 +127,11 @@ def _share_of_forces(effect: str, strength: float | None) -> float | None:
 
 def _law_with_numbers(said: Said) -> str:
     """`F = -c v, where c = 0.03 +- 0.002 N`."""
-    names = said.one.effect.coefficients
+    names = symbols(said.one)
     if not names:
         return law_text(said.one, {"expression": said.coefficients["expression"]})
-    return f"{symbolic_law(said.one)}, where {_listed([f'{name} = {said.value(name)}' for name in names], 'and')}"
+    values = [f"{shown} = {said.value(name)}" for name, shown in names.items()]
+    return f"{symbolic_law(said.one)}, where {_listed(values, 'and')}"
 
 
 def in_words(rival: str) -> str:
