@@ -19,6 +19,8 @@ from ._concealed_sensors import Setup
 FREQUENCIES, TIMES, HIDDEN, STOPS = 48, 24, 10, (0.7, 0.85, 0.95)
 _BENT = ("coulomb_friction", "contact_stop")
 _BATCH = 400  # lanes at a time
+# A candidate is not dosed beyond this share of the truth's response: over many swings even a small one is not linear.
+_GENTLE, _RUNAWAY = 0.01, 1e-3
 
 
 class Candidate(NamedTuple):
@@ -176,6 +178,19 @@ def responses(setup: Setup, public: Public, effects: Sequence[Effect]) -> np.nda
     return columns
 
 
+@np.errstate(all="ignore")  # what ran away is dosed less
+def _gently(setup: Setup, public: Public, effects: Sequence[Effect]) -> np.ndarray:
+    """The same, where those of large response are given in smaller doses; the first effect sets what is large."""
+    columns = responses(setup, public, effects)
+    size = DOSE * np.linalg.norm(columns, axis=0)
+    share = _GENTLE * np.linalg.norm(columns[:, 0]) / size
+    share = np.where(np.isfinite(size), share, _RUNAWAY)
+    strong = np.nonzero(share < 1)[0]
+    if len(strong):
+        columns[:, strong] = responses(setup, public, [effects[k].scaled(share[k]) for k in strong]) / share[strong]
+    return columns
+
+
 def _batch(setup: Setup, public: Public, effects: Sequence[Effect]) -> np.ndarray:
     """Lanes that each hold one dosed effect, and a last one that holds none."""
     merged: dict[tuple[Any, ...], list[int]] = {}
@@ -216,7 +231,7 @@ def ranked(form: Form, public: Public, kept: Sequence[Effect], truth: Effect, fo
     setup = form.setup
     basis = nuisances(setup, public)
     spans = [e for c in found for e in c.span]
-    whole = responses(setup, public, [truth, *kept, *spans])
+    whole = _gently(setup, public, [truth, *kept, *spans])
     price = float(np.log(len(whole)))
     whole = np.concatenate([whole, np.zeros((len(basis) - len(whole), whole.shape[1]))])
     whole = np.where(np.isfinite(whole), whole, 0.0)

@@ -11,7 +11,7 @@ from experiments._concealed_files import answer, recording_file
 from experiments._concealed_fit import Free, Given, fit
 from experiments._concealed_hiding import clean_readings, form_of, starts, weights
 from experiments._concealed_oracle import asked, consulted
-from experiments._concealed_rivals import nuisances, responses
+from experiments._concealed_rivals import candidates, nuisances, ranked, responses
 
 
 def test_a_fit_of_the_true_form_finds_the_truth():
@@ -53,6 +53,19 @@ def test_a_drag_of_another_power_is_a_rival():
     told = consulted(answer(case), case.noisy)
     assert told["margins"]["nothing"] > 100
     assert told["margins"]["quadratic_drag|theta for viscous_damping|theta"] < 6 and not told["nameable"]
+
+
+def test_a_rival_is_judged_in_a_dose_as_small_as_the_truth():
+    """Over fifty swings of a Duffing oscillator, a damping that takes a hundredth of its energy in all has the response
+    of its own word, of a quadratic drag and of dry friction: candidates are far stronger to begin with."""
+    setup, public = setting("duffing")
+    period = setup.system.period(setup.values)
+    setup = setup._replace(records=(setup.records[0]._replace(times=np.linspace(0.0, 50 * period, 400)),))
+    truth = Effect("viscous_damping", "q", {"c": float(2e-5 * setup.values["m"] * 2 * np.pi / period)})
+    rivals = ranked(form_of(setup, public), public, (), truth, candidates(setup, public, ()))
+    left = {r.effect.word: r.part for r in rivals}
+    assert all(left[word] < 1e-3 for word in ("viscous_damping", "quadratic_drag", "coulomb_friction"))
+    assert {r.effect.word for r in rivals[:3]} == {"viscous_damping", "quadratic_drag", "coulomb_friction"}
 
 
 def test_the_oracle_is_asked_once(tmp_path):
