@@ -56,8 +56,8 @@ def test_a_drag_of_another_power_is_a_rival():
 
 
 def test_a_rival_is_judged_in_a_dose_as_small_as_the_truth():
-    """Over fifty swings of a Duffing oscillator, a damping that takes a hundredth of its energy in all has the response
-    of its own word, of a quadratic drag and of dry friction: candidates are far stronger to begin with."""
+    """Over fifty swings of a Duffing oscillator, a damping that takes under a hundredth of its energy in all has the
+    response of its own word, of a quadratic drag and of dry friction: candidates are far stronger to begin with."""
     setup, public = setting("duffing")
     period = setup.system.period(setup.values)
     setup = setup._replace(records=(setup.records[0]._replace(times=np.linspace(0.0, 50 * period, 400)),))

@@ -102,21 +102,21 @@ def _pieces(
     problem: Problem, fits: Fits, errors: Sequence[np.ndarray], weight: Sequence[np.ndarray], b: int, j: int
 ) -> list[_Piece]:
     times = [r.times[: len(w)] for r, w in zip(problem.rows, weight, strict=True)]
-    rates = _rates([p.readings[b, :, j] for p in fits.predictions], times)
+    speeds = rates([p.readings[b, :, j] for p in fits.predictions], times)
     out = []
     for k, x in enumerate(errors):
         w = weight[k][:, j]
         slopes = np.where(w > 0, fits.predictions[k].slopes[b, :, :, j], 0.0)
         columns = np.concatenate([x[None], slopes])
-        out.append(_Piece(columns, rates[k], w, times[k]))
+        out.append(_Piece(columns, speeds[k], w, times[k]))
     return out
 
 
-def _rates(shown: Sequence[np.ndarray], times: Sequence[np.ndarray]) -> list[Float[np.ndarray, " _"]]:
+def rates(shown: Sequence[np.ndarray], times: Sequence[np.ndarray]) -> list[Float[np.ndarray, " _"]]:
     """How fast expected readings change, by recording, of a root mean square of one."""
-    rates = [np.gradient(y, t) if len(t) > 1 else np.ones(len(t)) for y, t in zip(shown, times, strict=True)]
-    size = float(np.sqrt(np.mean(np.concatenate(rates) ** 2)))
-    return [np.nan_to_num(rate / (size or 1.0)) for rate in rates]
+    found = [np.gradient(y, t) if len(t) > 1 else np.ones(len(t)) for y, t in zip(shown, times, strict=True)]
+    size = float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
+    return [np.nan_to_num(rate / (size or 1.0)) for rate in found]
 
 
 def whitened_beside(
@@ -126,7 +126,7 @@ def whitened_beside(
 ) -> list[Float[np.ndarray, "column _"]]:  # fmt: skip
     """One channel's columns, by recording, whitened beside errors of its sensor and of its clock; `shown` are the
     expected readings."""
-    pieces = [_Piece(x, rate, w, t) for x, rate, w, t in zip(columns, _rates(shown, times), weight, times, strict=True)]
+    pieces = [_Piece(x, rate, w, t) for x, rate, w, t in zip(columns, rates(shown, times), weight, times, strict=True)]
     return [_cleared(one, both)[0].T for one in pieces]
 
 

@@ -29,7 +29,7 @@ def colour_ratio(estimate: Estimate) -> Float[np.ndarray, " channel"]:
 
 def total_noise(estimate: Estimate) -> Float[np.ndarray, " channel"]:
     """White reading noise and errors that last together, so that a filter without these does not trust too much."""
-    return estimate.noise * np.sqrt(1.0 + colour_ratio(estimate))
+    return estimate.scatter * np.sqrt(1.0 + colour_ratio(estimate))
 
 
 def intensity_of(stepper: Stepper, estimate: Estimate) -> Float[np.ndarray, " d"]:

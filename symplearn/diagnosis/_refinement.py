@@ -88,7 +88,7 @@ class Refinement:
         under white noise looks for what takes a part of it."""
         ranked = sorted(self._mine(), key=self.found.odds, reverse=True)
         top, rest = self.found.odds(ranked[0]), speaker(self.found.estimates[ranked[0]])
-        if rest.kind in ("white", "static", "force", "spell"):
+        if rest.kind in ("white", "jitter", "static", "force", "spell"):
             return
         self.progress("weighing what may do as well beside the remainder")
         some: dict[Combination, Start] = {}

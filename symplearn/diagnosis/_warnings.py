@@ -22,6 +22,7 @@ _FAR = 10.0
 _REMAINDERS = {
     "coloured": "an error of the sensor",
     "clock": "an error of the clock",
+    "jitter": "an error of single times",
     "positional": "an error of the sensor that goes with what it reads",
     "static": "a small force that goes with place",
     "force": "a small missing force",

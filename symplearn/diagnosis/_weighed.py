@@ -32,9 +32,9 @@ class Estimate:
     """A combination fitted under one kind of remainder.
 
     `kind` is `white` (no remainder), `coloured` (an error of the sensor with a memory), `clock` (one of its clock
-    beside that), `positional` (one that goes with what is read), `static` (a small force that goes with a
-    coordinate), `force` (a white missing force of `intensity`) or `spell` (one that acts for a while: in the share
-    `exposures` of each span, by recording).
+    beside that), `positional` (one that goes with what is read), `jitter` (one of each row's time), `static` (a small
+    force that goes with a coordinate), `force` (a white missing force of `intensity`) or `spell` (one that acts for a
+    while: in the share `exposures` of each span, by recording).
     `noise` is the white sd of one original reading, `bent` the variance of a positional error against its square,
     `bends` that error itself.
     """
@@ -54,13 +54,19 @@ class Estimate:
     bent: tuple[float, ...] = ()
     bends: tuple[Bend, ...] = ()
     clocks: tuple[Colour, ...] = ()  # errors of the times, as the rms error of the reading that they make
+    jitters: tuple[float, ...] = ()  # variance of the error that single times make against the noise's
     modes: tuple[Mode, ...] = ()  # all optima that were found, this one among them
     outliers: tuple[tuple[float, float], ...] = ()  # share and size by channel, where they were left out
 
     @property
     def reading_noise(self) -> Float[np.ndarray, " channel"]:
-        """Sd of one original reading, with the rms of a positional error."""
-        return self.noise * np.sqrt(1.0 + np.array(self.bent or 0.0))
+        """Sd of one original reading, with the rms of a positional error and of one that jitter makes."""
+        return self.scatter * np.sqrt(1.0 + np.array(self.bent or 0.0))
+
+    @property
+    def scatter(self) -> Float[np.ndarray, " channel"]:
+        """Sd of what is new in every reading: noise, and jitter."""
+        return self.noise * np.sqrt(1.0 + np.array(self.jitters or 0.0))
 
 
 def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -> list[Estimate]:

@@ -10,6 +10,7 @@ from ._along import along, readings
 from ._calibrate import Fits, Priors, grow, residuals, weights
 from ._clock import weigh_clock
 from ._found import Found
+from ._jitter import weigh_jitter
 from ._noisy import PathFit, fit_paths
 from ._positional import weigh_positional
 from ._problem import MOST, Combination, Problem
@@ -148,7 +149,8 @@ class Weigher:
         for b, estimate in enumerate(weigh_white(self.problem, fits, priors, self.rows)):
             self._add(estimate, *self._outliers(fits, b))
         correlated = weigh_coloured(self.problem, fits, priors, self.rows)
-        for estimate in correlated + weigh_positional(self.problem, fits, priors, self.rows):
+        sensors = weigh_positional(self.problem, fits, priors, self.rows)
+        for estimate in correlated + sensors + weigh_jitter(self.problem, fits, priors, self.rows):
             self._add_beside_white(estimate)
 
     def weigh_clocks(self, combinations: Sequence[Combination]) -> None:
