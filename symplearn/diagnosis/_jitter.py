@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ._bearers import Sizes, borne, sizes
 from ._calibrate import Fits, Priors, residuals, weights
 from ._clock import rates
 from ._evidence import variance_inflation
@@ -54,10 +55,10 @@ def weigh_jitter(problem: Problem, fits: Fits, priors: Priors, rows: Sequence[in
     number = sum((w > 0).sum(0) for w in weight)
     for b in trusting(problem, fits):
         channels = [_channel(problem, fits, errors, weight, b, j) for j in range(problem.channels)]
-        ratios, occam = zip(*(_ratio(problem, one, j) for j, one in enumerate(channels)), strict=True)
+        ratios, occam = borne([_sizes(problem, one, j) for j, one in enumerate(channels)])
         whole = [one.columns * one.roots(ratio) for one, ratio in zip(channels, ratios, strict=True)]
         logs = np.array([one.log(ratio) for one, ratio in zip(channels, ratios, strict=True)])
-        one = correlated(problem, fits, b, np.stack([x @ x.T for x in whole]), logs, number, sum(occam), priors)
+        one = correlated(problem, fits, b, np.stack([x @ x.T for x in whole]), logs, number, occam, priors)
         column = np.concatenate([[1.0], fits.z[b] - one.z])
         left = [column @ x / noise for x, noise in zip(whole, one.noise, strict=True)]
         told = np.stack([np.where(c.seen, e, np.nan) for c, e in zip(channels, left, strict=True)], axis=1)
@@ -81,16 +82,16 @@ def _channel(
     return _Channel(np.concatenate(parts, axis=1), squares, np.concatenate([w[:, j] for w in weight]))
 
 
-def _ratio(problem: Problem, one: _Channel, j: int) -> tuple[float, float]:
-    """The likeliest variance of the error against the noise's, which may be known, and what its choice owes."""
-    known, number, values = problem.noise[j], max(int(one.seen.sum()), 1), []
+def _sizes(problem: Problem, one: _Channel, j: int) -> Sizes:
+    """Variances of the error against the noise's, which may be known."""
+    known, number = problem.noise[j], max(int(one.seen.sum()), 1)
     largest = REMAINDER * float(np.nanstd(np.concatenate([r.readings[:, j] for r in problem.rows])))
-    for ratio in _RATIOS:
+
+    def value(ratio: float) -> float:
         square = float(((one.columns[0] * one.roots(ratio)) ** 2).sum())
         white = max(square / number if np.isnan(known) else float(known) ** 2, 1e-300)
-        value = -0.5 * (number * np.log(white) + square / white + one.log(ratio))
-        values.append(value if ratio * white <= largest**2 else -np.inf)
-    best = int(np.argmax(values))
-    if not np.isfinite(values[best]):
-        return float(_RATIOS[0]), -np.inf
-    return float(_RATIOS[best]), float(np.log(np.mean(np.exp(np.array(values) - values[best]))))
+        if not ratio * white <= largest**2:
+            return -np.inf
+        return -0.5 * (number * np.log(white) + square / white + one.log(ratio))
+
+    return sizes(value, _RATIOS)

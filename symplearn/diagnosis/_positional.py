@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ._bearers import Sizes, borne, sizes
 from ._bend import Bend, polynomials
 from ._calibrate import Fits, Priors, residuals, weights
 from ._evidence import variance_inflation
@@ -76,11 +77,11 @@ def weigh_positional(problem: Problem, fits: Fits, priors: Priors, rows: Sequenc
     for b, combination in enumerate(fits.combinations):
         known = problem.noise_of(combination)
         channels = [_channel(problem, fits, b, rows, j) for j in range(problem.channels)]
-        ratios, occam = zip(*(_ratio(problem, one, j, known[j]) for j, one in enumerate(channels)), strict=True)
+        ratios, occam = borne([_sizes(problem, one, j, known[j]) for j, one in enumerate(channels)])
         both = [one.marginal(ratio) for one, ratio in zip(channels, ratios, strict=True)]
         grams, logs = np.stack([gram for gram, _ in both]), np.array([log for _, log in both])
         number = np.array([one.number for one in channels])
-        one = correlated(problem, fits, b, grams, logs, number, sum(occam), priors)
+        one = correlated(problem, fits, b, grams, logs, number, occam, priors)
         out.append(_told(problem, one, fits.z[b], channels, ratios, grams))
     return out
 
@@ -122,21 +123,20 @@ def whitened_along(
     return np.split(done, np.cumsum([len(one) for one in weight])[:-1], axis=1)
 
 
-def _ratio(problem: Problem, one: _Channel, j: int, known: float) -> tuple[float, float]:
-    """The likeliest variance of the error against the noise's, which may be known, and what its choice owes."""
-    values = []
+def _sizes(problem: Problem, one: _Channel, j: int, known: float) -> Sizes:
+    """Variances of the error against the noise's, which may be known."""
     spread = float(np.nanstd(np.concatenate([r.readings[:, j] for r in problem.rows])))
     bare = replace(one, columns=np.concatenate([one.columns[:1], one.columns[one.plain :]]), plain=1)
-    for ratio in _RATIOS:
+
+    def value(ratio: float) -> float:
         gram, log = bare.marginal(ratio)
         square = float(gram[0, 0])
-        white = square / max(one.number, 1) if np.isnan(known) else float(known) ** 2
-        value = -0.5 * (one.number * np.log(max(white, 1e-300)) + square / max(white, 1e-300) + log)
-        values.append(value if ratio * white <= (REMAINDER * spread) ** 2 else -np.inf)
-    best = int(np.argmax(values))
-    if not np.isfinite(values[best]):
-        return float(_RATIOS[0]), -np.inf
-    return float(_RATIOS[best]), float(np.log(np.mean(np.exp(np.array(values) - values[best]))))
+        white = max(square / max(one.number, 1) if np.isnan(known) else float(known) ** 2, 1e-300)
+        if not ratio * white <= (REMAINDER * spread) ** 2:
+            return -np.inf
+        return -0.5 * (one.number * np.log(white) + square / white + log)
+
+    return sizes(value, _RATIOS)
 
 
 def _told(
