@@ -28,7 +28,7 @@ def sizes(value: Callable[[float], float], tried: Float[np.ndarray, " size"]) ->
     if not np.isfinite(values[best]):
         return Sizes(float(tried[0]), 0.0, -np.inf, 0.0)
     mean = values[best] + float(np.log(np.mean(np.exp(values - values[best]))))
-    return Sizes(float(tried[best]), float(values[best]), mean, value(_NONE))
+    return Sizes(float(tried[best]), float(values[best]), float(mean), float(value(_NONE)))
 
 
 def borne(channels: Sequence[Sizes]) -> tuple[list[float], float]:
