@@ -6,6 +6,7 @@ import pytest
 
 from symplearn.diagnosis._calibrate import grow
 from symplearn.diagnosis._found import Found
+from symplearn.diagnosis._noisy import PathFit
 from symplearn.diagnosis._null_paths import null_paths
 from symplearn.diagnosis._score import Start
 from symplearn.diagnosis._start import priors_without_effects
@@ -49,6 +50,25 @@ def followed(omega, far):
     weigher = Weigher(stepper, Found(stepper.problem, priors))
     paths = null_paths(stepper, priors.mean, weigher.rows, priors, 16)
     return weigher, weigher.take_out_outliers(paths, priors)
+
+
+def test_a_path_that_goes_through_all_is_granted_no_more_for_them():
+    """Where the noise is not stated, a path that leaves a tenth of what it takes for its noise owes as much for four
+    readings far off as one that leaves all of it, but for their density under that noise."""
+    readings = np.cos(TIMES) + NOISE * np.random.default_rng(0).normal(size=len(TIMES))
+    readings[FAR] += 0.05
+    p = cases.problem(cases.simulation("p**2/2 + q**2/2"), [cases.recorded(TIMES, readings)], 0.25)
+    priors = priors_without_effects(p)
+    weigher = Weigher(Stepper(p), Found(p, priors))
+    member = next(m for m in p.searched if p.candidate(m).effect.name == "sensor_outliers")
+    path = np.stack([np.cos(TIMES), 0 * TIMES, -np.sin(TIMES), 0 * TIMES], axis=1)
+    out = np.zeros((len(TIMES), 1), bool)
+    out[FAR] = True
+    rest = np.sqrt(np.mean((readings - path[:, 0])[~out[:, 0]] ** 2))
+    fits = [PathFit((), np.zeros(1), priors.mean, np.full(1, size * rest), [path], left_out=(out,)) for size in (1, 10)]
+    one, ten = (weigher._path_owed(fit, (member,)) for fit in fits)
+    # 1e-9: round-off of logarithms.
+    assert ten - one == pytest.approx(-4 * np.log(10), rel=1e-9)
 
 
 @pytest.mark.slow

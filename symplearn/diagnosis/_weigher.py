@@ -105,7 +105,10 @@ class Weigher:
         """Log evidence of what was left out of a path."""
         assert fit.left_out is not None
         errors = np.concatenate([self._path_errors(fit, r) for r in range(len(self.rows))])
-        return self._owed(members, errors, np.concatenate(fit.left_out), fit.noise)
+        flagged = np.concatenate(fit.left_out)
+        # A path that a strong force bends towards every reading leaves less than the noise, which is no smaller for it.
+        rest = np.sqrt(np.nanmean(np.where(flagged, np.nan, errors) ** 2, axis=0))
+        return self._owed(members, errors / np.minimum(rest, 1.0), flagged, fit.noise)
 
     def _owed(self, members: Combination, errors: np.ndarray, flagged: np.ndarray, noise: np.ndarray) -> float:
         """Log evidence of the readings that were taken out, as a density in their own unit."""
