@@ -37,7 +37,8 @@ DAMPING, GAIN = 1 / (FAMILIES * 4 * 2), 1 / (FAMILIES * 5 * 2)  # of a drag on a
 ONE_TARGET = {"relative_damping", "coupling_spring", "central_correction", "gyroscopic_coupling",
               "parametric_modulation", "parameter_drift", "regime_change", "parameter_error"}  # fmt: skip
 
-KINDS = ("white", "coloured", "clock", "positional", "static", "force", "spell")
+KINDS = ("white", "coloured", "clock", "positional", "jitter", "static", "force", "spell")
+OTHERS = len(KINDS) - 1  # that are a remainder
 
 
 @pytest.fixture(scope="module")
@@ -237,8 +238,8 @@ def test_beside_a_finding_a_remainder_has_a_quarter(problem):
     """Of an effect's price, three quarters go to white noise alone and one to the kinds of remainder, which share it. A
     kind that gains more than the effect does has the price of `any` there, as all have without a finding."""
     one, nothing = (place(problem, "viscous_damping", "q1"),), [estimate(problem, (), 0.0, kind) for kind in KINDS]
-    values = dict(zip(KINDS, (2.0, 5.0, 3.5, 3.0, -1.0, 3.0, 2.5), strict=True))
-    shares = dict(zip(KINDS, (3 / 4, 1 / FAMILIES / 6, *[1 / 4 / 6] * 5), strict=True))
+    values = dict(zip(KINDS, (2.0, 5.0, 3.5, 3.0, 1.5, -1.0, 3.0, 2.5), strict=True))
+    shares = dict(zip(KINDS, (3 / 4, 1 / FAMILIES / OTHERS, *[1 / 4 / OTHERS] * (OTHERS - 1)), strict=True))
     kinds = [estimate(problem, one, value, kind) for kind, value in values.items()]
     p = posterior(problem, found(problem, *nothing, *kinds), 1.0)
     expected = DAMPING * sum(shares[kind] * np.exp(value) for kind, value in values.items())
@@ -265,11 +266,11 @@ def test_findings_that_explain_less_than_they_leave_must_predict(problem, ahead,
     kept = found(problem, *nothing, *(estimate(problem, one, value, kind) for kind, value in values.items()))
     kept.ahead = {(): Ahead(-3.0, False, False)} | ({} if ahead is None else {one: ahead})
     p = posterior(problem, kept, 1.0)
-    small, large = 3 / 4 * np.exp(2.0) + 1 / 4 / 6 * np.exp(3.0), 1 / FAMILIES / 6 * np.exp(5.0)
+    small, large = 3 / 4 * np.exp(2.0) + 1 / 4 / OTHERS * np.exp(3.0), 1 / FAMILIES / OTHERS * np.exp(5.0)
     mine, rest = (small + large, 0.0) if counts else (small, large)
     scored = np.exp(min((one.score for one in kept.ahead.values()) if ahead is None else [ahead.score]))
     assert p.named[0].probability / p.as_it_is == pytest.approx(DAMPING * mine * scored / np.exp(-3.0), rel=1e-9)
-    alone = np.mean([*[1.0] * 5, np.exp(3.0)]) / FAMILIES  # a spell has no score
+    alone = np.mean([*[1.0] * (OTHERS - 1), np.exp(3.0)]) / FAMILIES  # a spell has no score
     assert p.unexplained / p.as_it_is == pytest.approx(alone + DAMPING * rest * scored / np.exp(-3.0), rel=1e-9)
 
 
@@ -279,7 +280,8 @@ def test_how_a_trajectory_goes_on_says_nothing_of_a_spell(problem):
     kept = found(problem, *nothing, *alike(problem, one, 0.0))
     kept.ahead = {(): Ahead(-4.0, False, False), one: Ahead(0.0, True, True)}
     p = posterior(problem, kept, 1.0)
-    assert p.unexplained / p.as_it_is == pytest.approx(np.mean([*[1.0] * 5, np.exp(4.0)]) / FAMILIES, rel=1e-9)
+    alone = np.mean([*[1.0] * (OTHERS - 1), np.exp(4.0)]) / FAMILIES
+    assert p.unexplained / p.as_it_is == pytest.approx(alone, rel=1e-9)
 
 
 def test_beside_a_spell_a_finding_need_not_go_on(problem):
@@ -289,7 +291,7 @@ def test_beside_a_spell_a_finding_need_not_go_on(problem):
     kept = found(problem, *nothing, estimate(problem, one, 2.0), estimate(problem, one, 32.0, "spell"))
     kept.ahead = {(): Ahead(0.0, False, False), one: Ahead(0.0, False, False)}
     p = posterior(problem, kept, 1.0)
-    expected = DAMPING * (3 / 4 * np.exp(2.0) + np.exp(32.0) / FAMILIES / 6)
+    expected = DAMPING * (3 / 4 * np.exp(2.0) + np.exp(32.0) / FAMILIES / OTHERS)
     assert p.named[0].probability / p.as_it_is == pytest.approx(expected, rel=1e-9)
 
 
