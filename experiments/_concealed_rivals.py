@@ -20,6 +20,7 @@ FREQUENCIES, TIMES, HIDDEN, STOPS = 48, 24, 10, (0.7, 0.85, 0.95)
 _BENT = ("coulomb_friction", "contact_stop")
 _BATCH = 400  # lanes at a time
 # A candidate is not dosed beyond this share of the truth's response: over many swings even a small one is not linear.
+# One that runs away is dosed by the second.
 _GENTLE, _RUNAWAY = 0.01, 1e-3
 
 

@@ -38,6 +38,7 @@ def test_a_single_channel_bears_it():
     """Of one channel it is the mean over sizes alone."""
     value, tried = gaussian(0.0, 1.0), np.geomspace(0.1, 10.0, 5)
     ((chosen,), owed) = borne([sizes(value, tried)])
+    # 1e-12: round-off.
     assert value(chosen) + owed == pytest.approx(np.log(np.mean(np.exp([value(size) for size in tried]))), abs=1e-12)
 
 
@@ -60,4 +61,5 @@ def test_the_straight_sensor_is_left_straight():
     fits = calibrate(Stepper(p), begin, [()], priors, [len(TIMES)])
     (one,) = weigh_positional(p, fits, priors, [len(TIMES)])
     assert one.bent[0] > 1.0 and one.bent[1] < 1e-6
+    # Of 250 readings the standard deviation has a standard error of 4.5 %.
     assert one.reading_noise[1] == pytest.approx(NOISE, rel=0.15)

@@ -55,20 +55,33 @@ def followed(omega, far):
 def test_a_path_that_goes_through_all_is_granted_no_more_for_them():
     """Where the noise is not stated, a path that leaves a tenth of what it takes for its noise owes as much for four
     readings far off as one that leaves all of it, but for their density under that noise."""
-    readings = np.cos(TIMES) + NOISE * np.random.default_rng(0).normal(size=len(TIMES))
-    readings[FAR] += 0.05
-    p = cases.problem(cases.simulation("p**2/2 + q**2/2"), [cases.recorded(TIMES, readings)], 0.25)
+    errors = np.random.default_rng(0).normal(size=len(TIMES))
+    rest = NOISE * np.sqrt(np.mean(np.delete(errors, FAR) ** 2))
+    one, ten = (owed(NOISE * errors, size * rest) for size in (1, 10))
+    # 1e-9: round-off of logarithms.
+    assert ten - one == pytest.approx(-4 * np.log(10), rel=1e-9)
+
+
+def test_under_a_noise_that_is_given_no_error_is_made_larger():
+    """There a path that leaves a half of it or a tenth owes the same for the four within half a nat: nearer to the
+    middle the two scales differ a little less from one."""
+    errors = np.random.default_rng(0).normal(size=len(TIMES))
+    half, tenth = (owed(share * NOISE * errors, NOISE, f"[recording.noise]\ny = {NOISE}") for share in (0.5, 0.1))
+    assert half == pytest.approx(tenth, abs=0.5)
+
+
+def owed(errors, noise, more=""):
+    """What four readings far off a swing owe beside the true path of the others, which leaves these errors of them."""
+    readings = np.cos(TIMES) + errors
+    readings[FAR] = np.cos(TIMES[FAR]) + 0.05
+    p = cases.problem(cases.simulation("p**2/2 + q**2/2", more=more), [cases.recorded(TIMES, readings)], 0.25)
     priors = priors_without_effects(p)
-    weigher = Weigher(Stepper(p), Found(p, priors))
     member = next(m for m in p.searched if p.candidate(m).effect.name == "sensor_outliers")
     path = np.stack([np.cos(TIMES), 0 * TIMES, -np.sin(TIMES), 0 * TIMES], axis=1)
     out = np.zeros((len(TIMES), 1), bool)
     out[FAR] = True
-    rest = np.sqrt(np.mean((readings - path[:, 0])[~out[:, 0]] ** 2))
-    fits = [PathFit((), np.zeros(1), priors.mean, np.full(1, size * rest), [path], left_out=(out,)) for size in (1, 10)]
-    one, ten = (weigher._path_owed(fit, (member,)) for fit in fits)
-    # 1e-9: round-off of logarithms.
-    assert ten - one == pytest.approx(-4 * np.log(10), rel=1e-9)
+    fit = PathFit((), np.zeros(1), priors.mean, np.full(1, noise), [path], left_out=(out,))
+    return Weigher(Stepper(p), Found(p, priors))._path_owed(fit, (member,))
 
 
 @pytest.mark.slow

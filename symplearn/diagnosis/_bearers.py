@@ -1,4 +1,4 @@
-"""Which channels bear a remainder of the sensors: all of them, or a single one."""
+"""Which channels bear a remainder of the sensors, and how large it is: all of them, or a single one."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -6,6 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import logsumexp
+
+from ._problem import Problem
+from ._weighed import REMAINDER
 
 # As good as none.
 _NONE = 1e-12
@@ -19,6 +22,28 @@ class Sizes(NamedTuple):
     largest: float
     mean: float
     without: float
+
+
+class Left(NamedTuple):
+    """What an error of some size leaves of one channel: the whitened errors' sum of squares, and the log determinant
+    of their covariance by the noise's variance."""
+
+    square: float
+    log: float
+
+
+def log_likelihood(left: Left, number: int, known: float, variance: float, most: float) -> float:
+    """Log likelihood of a channel's readings, but for a constant, under a noise that is `known`, or at its likeliest
+    where that is NaN; minus infinity where the error, of a `variance` in the noise's, is larger than `most`."""
+    white = max(left.square / max(number, 1) if np.isnan(known) else known**2, 1e-300)
+    if not variance * white <= most**2:
+        return -np.inf
+    return -0.5 * (number * float(np.log(white)) + left.square / white + left.log)
+
+
+def largest(problem: Problem, channel: int) -> float:
+    """The largest error of a sensor that is not the signal."""
+    return REMAINDER * float(np.nanstd(np.concatenate([r.readings[:, channel] for r in problem.rows])))
 
 
 def sizes(value: Callable[[float], float], tried: Float[np.ndarray, " size"]) -> Sizes:

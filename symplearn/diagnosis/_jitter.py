@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ._bearers import Sizes, borne, sizes
+from ._bearers import Left, Sizes, borne, largest, log_likelihood, sizes
 from ._calibrate import Fits, Priors, residuals, weights
 from ._clock import rates
 from ._evidence import variance_inflation
 from ._problem import Problem
 from ._scatter import law_gain
-from ._weighed import REMAINDER, Estimate, correlated, trusting
+from ._weighed import Estimate, correlated, trusting
 
 # Variances of the error against the noise's that are tried, where the rate is its root mean square.
 _RATIOS = np.geomspace(0.02, 50.0, 12)
@@ -39,9 +39,10 @@ class _Channel:
         """What a reading is to be multiplied by to be in units of one reading's noise."""
         return np.sqrt(self.weight / (1.0 + ratio * self.rates))
 
-    def log(self, ratio: float) -> float:
-        """Sum of the log variances, by the noise's."""
-        return -2 * float(np.log(self.roots(ratio)[self.seen]).sum())
+    def left(self, ratio: float) -> Left:
+        """What is left of the errors."""
+        root = self.roots(ratio)
+        return Left(float(((self.columns[0] * root) ** 2).sum()), -2 * float(np.log(root[self.seen]).sum()))
 
 
 @np.errstate(all="ignore")  # a lane that diverged is told by its evidence
@@ -57,7 +58,7 @@ def weigh_jitter(problem: Problem, fits: Fits, priors: Priors, rows: Sequence[in
         channels = [_channel(problem, fits, errors, weight, b, j) for j in range(problem.channels)]
         ratios, occam = borne([_sizes(problem, one, j) for j, one in enumerate(channels)])
         whole = [one.columns * one.roots(ratio) for one, ratio in zip(channels, ratios, strict=True)]
-        logs = np.array([one.log(ratio) for one, ratio in zip(channels, ratios, strict=True)])
+        logs = np.array([one.left(ratio).log for one, ratio in zip(channels, ratios, strict=True)])
         one = correlated(problem, fits, b, np.stack([x @ x.T for x in whole]), logs, number, occam, priors)
         column = np.concatenate([[1.0], fits.z[b] - one.z])
         left = [column @ x / noise for x, noise in zip(whole, one.noise, strict=True)]
@@ -84,14 +85,5 @@ def _channel(
 
 def _sizes(problem: Problem, one: _Channel, j: int) -> Sizes:
     """Variances of the error against the noise's, which may be known."""
-    known, number = problem.noise[j], max(int(one.seen.sum()), 1)
-    largest = REMAINDER * float(np.nanstd(np.concatenate([r.readings[:, j] for r in problem.rows])))
-
-    def value(ratio: float) -> float:
-        square = float(((one.columns[0] * one.roots(ratio)) ** 2).sum())
-        white = max(square / number if np.isnan(known) else float(known) ** 2, 1e-300)
-        if not ratio * white <= largest**2:
-            return -np.inf
-        return -0.5 * (number * np.log(white) + square / white + one.log(ratio))
-
-    return sizes(value, _RATIOS)
+    known, number, most = problem.noise[j], int(one.seen.sum()), largest(problem, j)
+    return sizes(lambda ratio: log_likelihood(one.left(ratio), number, known, ratio, most), _RATIOS)

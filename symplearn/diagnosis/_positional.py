@@ -12,13 +12,13 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ._bearers import Sizes, borne, sizes
+from ._bearers import Left, Sizes, borne, largest, log_likelihood, sizes
 from ._bend import Bend, polynomials
 from ._calibrate import Fits, Priors, residuals, weights
 from ._evidence import variance_inflation
 from ._problem import Problem
 from ._scatter import factor_evidence, law_gain
-from ._weighed import REMAINDER, Estimate, amplitudes_out, correlated
+from ._weighed import Estimate, amplitudes_out, correlated
 
 # Variances of the error against the noise's that are tried.
 _RATIOS = np.geomspace(0.03, 1e4, 12)
@@ -125,16 +125,12 @@ def whitened_along(
 
 def _sizes(problem: Problem, one: _Channel, j: int, known: float) -> Sizes:
     """Variances of the error against the noise's, which may be known."""
-    spread = float(np.nanstd(np.concatenate([r.readings[:, j] for r in problem.rows])))
     bare = replace(one, columns=np.concatenate([one.columns[:1], one.columns[one.plain :]]), plain=1)
+    most = largest(problem, j)
 
     def value(ratio: float) -> float:
         gram, log = bare.marginal(ratio)
-        square = float(gram[0, 0])
-        white = max(square / max(one.number, 1) if np.isnan(known) else float(known) ** 2, 1e-300)
-        if not ratio * white <= (REMAINDER * spread) ** 2:
-            return -np.inf
-        return -0.5 * (one.number * np.log(white) + square / white + log)
+        return log_likelihood(Left(float(gram[0, 0]), log), one.number, known, ratio, most)
 
     return sizes(value, _RATIOS)
 

@@ -106,10 +106,12 @@ class Weigher:
         assert fit.left_out is not None
         errors = np.concatenate([self._path_errors(fit, r) for r in range(len(self.rows))])
         flagged = np.concatenate(fit.left_out)
-        # A path that a strong force bends towards every reading leaves less than the noise, which is no smaller for it.
+        # A path that a strong force bends towards every reading leaves less than the noise, which is no smaller for it;
+        # where the noise is given, the evidence takes it as it is.
         used = np.isfinite(errors) & ~flagged
         rest = np.sqrt((np.where(used, errors, 0.0) ** 2).sum(0) / np.maximum(used.sum(0), 1))
-        return self._owed(members, errors / np.where(rest > 0, np.minimum(rest, 1.0), 1.0), flagged, fit.noise)
+        less = np.isnan(self.problem.noise) & (rest > 0) & (rest < 1)
+        return self._owed(members, errors / np.where(less, rest, 1.0), flagged, fit.noise)
 
     def _owed(self, members: Combination, errors: np.ndarray, flagged: np.ndarray, noise: np.ndarray) -> float:
         """Log evidence of the readings that were taken out, as a density in their own unit."""
