@@ -1,6 +1,6 @@
 """The words of `[[terms]]`: every effect of the contract, its target and its coefficients."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 COORDINATE, PAIR, PARAMETER, COLUMN = "coordinate", "pair of coordinates", "parameter", "observed column"
@@ -57,3 +57,8 @@ FORBIDDEN: dict[tuple[str, str], tuple[Callable[[float], bool], str]] = {
     ("sensor_outliers", "sd"): (lambda value: value == 0, "be greater than zero"),
     ("sensor_outliers", "e"): (lambda value: value > 1, "lie between 0 and 1"),
 }
+
+
+def symbol(name: str, targets: Sequence[str]) -> str:
+    """What a law calls a coefficient: its name, with an index where a target is called so."""
+    return f"{name}_0" if name in targets else name

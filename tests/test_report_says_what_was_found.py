@@ -222,6 +222,17 @@ def test_every_coefficient_of_a_finding_has_its_row():
     assert "parameter drift of m, sensor bias of left in recording 1 only" in text_of(page, "remains")
 
 
+def test_the_table_calls_a_coefficient_as_its_sentence_does():
+    """The place of a stop on the coordinate `a` has an index; its stiffness has none."""
+    numbers = {name: {"mean": 1.0, "sd": 0.1, "interval95": [0.8, 1.2]} for name in ("k", "a")}
+    diagnosis = cases.damped_pendulum()
+    stop = diagnosis.document["findings"][0] | {"effect": "contact_stop", "target": "a", "coefficients": numbers}
+    page = html_report(
+        dataclasses.replace(diagnosis, coordinates=("a",), document=diagnosis.document | {"findings": [stop]})
+    )
+    assert [row[0] for row in rows_of(page, "findings")][1:] == ["k", "a_0"]
+
+
 def test_new_equations_do_not_shift_the_old_ones():
     """A line that has no like before is new as a whole; the others keep their partner."""
     before = ("H = p**2/2", "dp/dt = -dH/dq", "y = q")

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from .._effects import Candidate
-from .._vocabulary import COLUMN, PAIR, PARAMETER
+from .._vocabulary import COLUMN, PAIR, PARAMETER, symbol
 
 # What each effect adds to the force on its first and second coordinate (contract, section 3).
 _FORCES: dict[str, tuple[str, ...]] = {
@@ -75,8 +75,8 @@ def symbolic_law(one: Candidate) -> str:
 
 
 def symbols(one: Candidate) -> dict[str, str]:
-    """What a law calls the coefficients of the contract: their names, with an index where a target is called so."""
-    return {name: f"{name}_0" if name in one.targets else name for name in one.effect.coefficients}
+    """What a law calls the coefficients of the contract, by their names."""
+    return {name: symbol(name, one.targets) for name in one.effect.coefficients}
 
 
 def equation_lines(

@@ -8,12 +8,13 @@ import jinja2
 from markupsafe import Markup, escape
 
 from .._errors import printable
+from .._vocabulary import symbol
 from ..diagnosis._record import Diagnosis
 from ._equation import equation_pairs
 from ._figures import not_drawn, plates
 from ._units import coefficient_unit
 from ._verdict import PROBLEM, verdict_sentence, where_and_when
-from ._words import DASH, combination, effect, estimate, interval, number, plain, probability, ratio
+from ._words import DASH, combination, effect, estimate, interval, number, plain, probability, ratio, targets
 
 
 def html_report(diagnosis: Diagnosis) -> str:
@@ -72,7 +73,7 @@ def _exactly(text: str) -> Markup:
 def _finding(finding: Mapping[str, Any], diagnosis: Diagnosis) -> dict[str, Any]:
     coefficients = [
         {
-            "name": name,
+            "name": symbol(name, targets(finding)),
             "mean": number(value["mean"]) if isinstance(value, Mapping) else str(value),
             "sd": number(value["sd"], 2) if isinstance(value, Mapping) else DASH,
             "interval": interval(value["interval95"]) if isinstance(value, Mapping) else DASH,
