@@ -54,12 +54,12 @@ def weighed():
     return of
 
 
-def responses():
-    """What a force of each Legendre polynomial does to the place of the spring, to first order, by SciPy."""
-    q = swing()[:, 0]
+def responses(low, high):
+    """What a force of each Legendre polynomial over a range does to the place of the spring, to first order, by
+    SciPy."""
 
     def rates(t, x):
-        place = 2 * (x[0] - q.min()) / np.ptp(q) - 1
+        place = 2 * (x[0] - low) / (high - low) - 1
         legendre = np.sqrt(2 * np.arange(6) + 1) * np.polynomial.legendre.legvander([place], 5)[0]
         return np.concatenate([[x[1], -x[0] - DRAG * x[1]], x[8:], -x[2:8] - DRAG * x[8:] + legendre])
 
@@ -69,18 +69,24 @@ def responses():
 @pytest.mark.parametrize(("gap", "lengths"), [((0, 0), (300,)), ((8, 14), (300,)), ((0, 0), (200, 300))])
 def test_it_is_integrated_out(weighed, gap, lengths):
     """What it gains on white noise is what a dense Gaussian process gains whose kernel is made of the responses by
-    SciPy, on average over the sizes of half the noise and less; readings may be missing, and recordings several."""
+    SciPy, on average over the sizes of half the noise and less and over all shapes and those that are odd; readings may
+    be missing, and recordings several."""
     ys, ((white, _), (static, _)) = weighed(lambda q: 0.01 * q**5, gap=gap, lengths=lengths)
     y, start = np.concatenate(ys), np.stack([swing(start=one)[:, 0] for one in ((1.0, 0.0), (0.0, 1.0))])
     seen = ~np.isnan(y)
     error = (y - np.concatenate([start[0, :n] for n in lengths]))[seen]
-    pushed = np.concatenate([responses()[:, :n] for n in lengths], axis=1)[:, seen]
+    q = swing()[:, 0]
+    reach = np.abs(q).max()
+    families = [responses(q.min(), q.max()), responses(-reach, reach)[1::2]]
     moved = WIDE * block_diag(*(start[:, :n] for n in lengths))[:, seen]
     plain = NOISE**2 * np.eye(len(error)) + moved.T @ moved
-    unit = np.sqrt(len(error) / np.trace(pushed @ np.linalg.solve(plain, pushed.T)))  # leaves as much as the noise
-    some = [plain, *(plain + (size * unit) ** 2 * pushed.T @ pushed for size in (0.5, 0.25, 0.125, 0.0625))]
+    some = [plain]
+    for family in families:
+        pushed = np.concatenate([family[:, :n] for n in lengths], axis=1)[:, seen]
+        unit = np.sqrt(len(error) / np.trace(pushed @ np.linalg.solve(plain, pushed.T)))  # leaves as much as the noise
+        some += [plain + (size * unit) ** 2 * pushed.T @ pushed for size in (0.5, 0.25, 0.125, 0.0625)]
     nothing, *logs = [multivariate_normal.logpdf(error, cov=covariance) for covariance in some]
-    expected = logsumexp(logs) - np.log(4) - nothing
+    expected = logsumexp(logs) - np.log(8) - nothing
     assert expected > 10
     # Seen: 0.02 to 0.06 of 15 to 44. Heavier tails are on offer beside either, and the shapes go over the range of the
     # fitted motion, here of the true one.

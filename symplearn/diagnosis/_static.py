@@ -2,8 +2,9 @@
 
 Such a force repeats with the motion, and a part of it is like any stiffness of the vocabulary. It is a random function
 of one coordinate: Legendre polynomials over the range of the motion with independent amplitudes of one size, which
-enter to first order about the trajectory and are integrated out. It is small: what the other unknowns do not take over
-has a prior rms of half the noise at most. A larger one is physics that was left out, and a stiffness has a name.
+enter to first order about the trajectory and are integrated out. Where one side is as the other it has the odd ones
+alone, over a range that reaches as far on both. It is small: what the other unknowns do not take over has a prior rms
+of half the noise at most. A larger one is physics that was left out, and a stiffness has a name.
 """
 
 from collections.abc import Sequence
@@ -49,7 +50,8 @@ class _Push:
 def weigh_static(stepper: Stepper, fits: Fits, priors: Priors, rows: Sequence[int]) -> list[Estimate]:
     """Estimates beside a small force that goes with one coordinate, about the trajectory fit.
 
-    Which coordinate, and how large: on average over all of either; numbers are those of the likeliest.
+    Which coordinate, how large, and whether one side is as the other: on average over all of each; numbers are those
+    of the likeliest.
     """
     problem, weight = stepper.problem, weights(stepper.problem, rows)
     r, out = residuals(problem, fits.predictions, weight), []
@@ -70,7 +72,7 @@ def weigh_static(stepper: Stepper, fits: Fits, priors: Priors, rows: Sequence[in
 def _responses(
     stepper: Stepper, fits: Fits, rows: Sequence[int]
 ) -> list[list[list[Float[np.ndarray, "amplitude _ channel"]]]]:
-    """Of all readings to a force of every shape, by lane, coordinate and recording."""
+    """Of all readings to a force of every shape, by lane, coordinate (once for each family of shapes) and recording."""
     problem, number = stepper.problem, stepper.problem.equations.declared
     units = [[Unit(_candidate(problem, k, i), None) for k in range(len(_FORCES))] for i in range(number)]
     laid = [layout(problem, some) for some in units]
@@ -79,15 +81,27 @@ def _responses(
     found = []
     for k in range(len(lanes)):
         q = np.concatenate([by_lane[k][0][:, problem.channels + k % number] for by_lane in shown])
-        shapes = _polynomials(float(q.min()), float(q.max()))
-        found.append([np.einsum("ak,ktm->atm", shapes, by_lane[k][1][:, :, : problem.channels]) for by_lane in shown])
-    return [found[a : a + number] for a in range(0, len(found), number)]
+        powers = [by_lane[k][1][:, :, : problem.channels] for by_lane in shown]
+        found += [[np.einsum("ak,ktm->atm", shapes, one) for one in powers] for shapes in _families(q)]
+    each = len(found) // len(fits.z)
+    return [found[a : a + each] for a in range(0, len(found), each)]
 
 
 def _candidate(problem: Problem, power: int, place: int) -> int:
     """Number of the force that is a power of a coordinate."""
     return next(n for n, one in enumerate(problem.equations.candidates)
                 if one.effect is _FORCES[power] and one.place == place)  # fmt: skip
+
+
+def _families(q: Float[np.ndarray, " row"]) -> list[Float[np.ndarray, "amplitude power"]]:
+    """Shapes of a force over the range of a motion: all, and those of a force that is odd in the coordinate.
+
+    A wrong geometry mostly keeps the symmetry that the right one has. Even shapes, which are not there, would then cost
+    as much as the data are sure of that.
+    """
+    reach = float(np.abs(q).max())
+    odd = np.arange(len(_FORCES)) % 2 == 1
+    return [_polynomials(float(q.min()), float(q.max())), np.where(odd[:, None], _polynomials(-reach, reach), 0.0)]
 
 
 def _polynomials(low: float, high: float) -> Float[np.ndarray, "amplitude power"]:
