@@ -3,6 +3,7 @@
 import engine_cases as cases
 import numpy as np
 import pytest
+import sympy
 
 from symplearn.diagnosis import Options, diagnose
 from symplearn.diagnosis._build import Restriction
@@ -155,3 +156,27 @@ def test_what_has_no_name_gets_none():
     assert found["verdict"] in ("unexplained", "mismatch")
     assert all(one["probability"] < 0.9 for one in found["findings"] if one["effect"] != "unnamed_force")
     assert found["fit"]["before"]["process_noise_sd"]["p"] > 0
+
+
+def test_a_force_without_a_name_is_written_out():
+    """A cart is pulled by the square of where the other one is, and does not pull back, which no word says: the force
+    stands there as an expression, in the finding, in its place and in the simulation that has it."""
+    times = np.linspace(0.0, 20.0, 160)
+    push = lambda t, x: [x[2], x[3], -x[0] + 0.6 * (x[1] - x[0]), -1.6 * x[1] + 0.6 * (x[0] - x[1]) - 0.4 * x[0] ** 2]  # noqa: E731
+    x = cases.solved(push, [0.6, -0.3, 0.0, 0.2], times)[:, :2]
+    file = cases.simulation("(p1**2 + p2**2 + x1**2 + 1.6*x2**2)/2 + 0.3*(x1 - x2)**2", ["x1", "x2"], ["p1", "p2"],
+                            {"a": "x1", "b": "x2"})  # fmt: skip
+    run = cases.recorded(times, x + 0.005 * np.random.default_rng(2).normal(size=x.shape), columns=("a", "b"))
+    some = Restriction(("viscous_damping", "cubic_stiffness", "unnamed_force"))
+    told = diagnose(file, [run], Options(restriction=some, jobs=2))
+    (finding,) = told.document["findings"]
+    assert told.document["verdict"] == "mismatch" and finding["effect"] == "unnamed_force"
+    assert finding["target"] == "x2" and finding["family"] == "any"
+    location = told.document["location"]
+    assert location["targets"] == ["x2"] and location["time_windows"] == [[0.0, 20.0]]
+    law = sympy.sympify(finding["coefficients"]["expression"])
+    points = np.random.default_rng(3).uniform(-0.6, 0.6, (50, 2))
+    force = np.array([float(law.subs({"x1": a, "x2": b})) for a, b in points])
+    # Seen: 0.002 of 0.14.
+    assert np.abs(force + 0.4 * points[:, 0] ** 2).max() < 0.03
+    assert [(one.effect, one.target) for one in told.augmented.terms] == [("unnamed_force", ("x2",))]

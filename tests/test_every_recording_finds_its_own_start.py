@@ -26,7 +26,8 @@ def swings():
 
 
 def test_the_first_lane_begins_every_recording_well(swings):
-    """Of two lanes, each right for one of two recordings, comes one that is right for both and one wrong for both."""
+    """Of two lanes, each right for one of two recordings, comes one that is right for both, and then one that is right
+    for the first."""
     problem = swings.problem
     q, p = np.array([0, 1]) * problem.equations.width
     bad = np.array([0.1, 0.1])
@@ -37,11 +38,20 @@ def test_the_first_lane_begins_every_recording_well(swings):
             z[lane, r * problem.state + np.array([q, p])] = GOOD[r] if r == lane else bad
     rows = [len(TIMES)] * 2
     found = begin._recombined(problem, z, swings.predict(z, [(), ()], rows), rows)
-    for r in range(2):
-        own = r * problem.state + np.array([q, p])
-        np.testing.assert_array_equal(found[:, own], [GOOD[r], bad])
+    for r, expected in enumerate([[GOOD[0], GOOD[0]], [GOOD[1], bad]]):
+        np.testing.assert_array_equal(found[:, r * problem.state + np.array([q, p])], expected)
     # The calibrated value is that of the lane that begins the first recording.
-    np.testing.assert_array_equal(found[:, problem.head], [1.0, 1.001])
+    np.testing.assert_array_equal(found[:, problem.head], [1.0, 1.0])
+
+
+def test_starts_are_tried_in_every_mixture(swings):
+    """Of three recordings with two, one and three starts apart all six mixtures come, those of the best starts first;
+    more lanes than mixtures are filled rank by rank. Starts that differ by a thousandth are one."""
+    ranks = begin._ranks([2, 1, 3], 8)
+    assert ranks[0] == (0, 0, 0) and sorted(ranks[:6]) == [(a, 0, b) for a in range(2) for b in range(3)]
+    assert [sum(one) for one in ranks[:6]] == [0, 1, 1, 2, 2, 3] and ranks[6:] == [(6, 6, 6), (7, 7, 7)]
+    states = np.array([[1.0, -2.0], [1.001, -2.0], [1.0, 2.0], [np.nan, 2.0], [0.999, 2.001]])
+    assert begin._apart_first(states) == ([0, 2, 3], [1, 4])
 
 
 def test_what_follows_the_first_readings_best_is_tried_first(swings):
@@ -107,6 +117,39 @@ def test_an_orbit_of_which_one_coordinate_is_read_finds_its_start():
         # Five standard errors of 24 rows, by the fit's own slopes: 0.005 at most along x, 0.009 along y.
         assert (x, px) == pytest.approx((start[0], start[2]), abs=0.025)
         assert (side * y, side * py) == pytest.approx((start[1], start[3]), abs=0.045)
+
+
+RINGS = ((1.1, 0.0, 0.3, 1.5), (-0.4, 0.9, -1.3, -0.2))
+
+
+def test_starts_that_mirror_each_other_are_told_apart_together():
+    """Of a ring with a magnetic field distance and sum of the coordinates are read, by DOP853: the best lane begins
+    both recordings where they began, and the next ones begin one or both at the mirror image, where the coordinates are
+    exchanged and only the field goes the wrong way."""
+    m, field, k = 1.7, 0.9, 8.0
+
+    def rates(t, s):
+        x, y, px, py = s
+        vx, vy = (px + field * y / 2) / m, (py - field * x / 2) / m
+        r = np.hypot(x, y)
+        return [vx, vy, field * vy / 2 - k * (r - 1) * x / r, -field * vx / 2 - k * (r - 1) * y / r]
+
+    times, rng, runs = np.arange(200) * 0.1, np.random.default_rng(4), []
+    for number, start in enumerate(RINGS, start=1):
+        x, y = cases.solved(rates, start, times)[:, :2].T
+        read = np.stack([x + y, np.hypot(x, y)], axis=1) + [0.06, 0.03] * rng.normal(size=(200, 2))
+        runs.append(cases.recorded(times, read, columns=("s", "d"), number=number))
+    file = cases.simulation("((px + B*y/2)**2 + (py - B*x/2)**2)/(2*m) + k*(sqrt(x**2 + y**2) - 1)**2/2", ("x", "y"),
+                            ("px", "py"), {"s": "x + y", "d": "sqrt(x**2 + y**2)"},
+                            "[parameters]\nm = 1.7\nB = { value = 0.9, sd = 0.1 }\nk = { value = 8.0 }")  # fmt: skip
+    problem = cases.problem(file, runs, 0.05)
+    found = first_fits(Stepper(problem), priors_without_effects(problem), [200, 200])
+    place = np.array([0, 1, problem.equations.width, problem.equations.width + 1])
+    for r, start in enumerate(RINGS):
+        # Seen: 0.09. Sixteen rows of either hardly tell the field from the speed.
+        np.testing.assert_allclose(found.z[0][r * problem.state + place], start, atol=0.15)
+    mirrored = [tuple(bool(z[r * problem.state] < z[r * problem.state + 1]) for r in range(2)) for z in found.z[:4]]
+    assert set(mirrored) == {(a, b) for a in (False, True) for b in (False, True)}
 
 
 @pytest.mark.slow

@@ -116,7 +116,7 @@ def present_windows(
         first, last = float(o.rows.times[0]), float(o.rows.times[-1])
         gap = float(np.median(np.diff(o.rows.times)))
         mine = [m for m in combination if o.recording in problem.members[m].recordings]
-        windows = [_window(problem.candidate(m), values[m], first, last, gap) for m in mine]
+        windows = [_window(problem.candidate(m), values.get(m, {}), first, last, gap) for m in mine]
         if any(w == (first, last) for w in windows):
             windows = [(first, last)]
         number: list[float | int] = [o.recording + 1] if len(outlooks) > 1 else []

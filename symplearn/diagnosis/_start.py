@@ -1,10 +1,12 @@
 """Where the fits begin: initial states found in a short window, from many starts."""
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ._along import along, along_all, force, readings, velocity
 from ._calibrate import Fits, Priors, calibrate, residuals, weights
@@ -19,6 +21,8 @@ _SPREADS = (1e-3, 0.1, 1.0, 10.0)
 _SHORT = (8, 14)
 # Where nothing is known: this many times the size of what was found.
 _WIDE = 10.0
+# Starts that differ by less than this share of their size are one; a size that few of them exceed.
+_ALIKE, _LARGE = 0.05, 0.9
 # Relative round-off of forces a whole turn on.
 _ROUND_OFF = 1e-9
 
@@ -69,7 +73,9 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
         z = _recombined(problem, fits.z, fits.predictions, short[number - 1])[:_STARTS]
         held = tight if number < len(_SHORT) + 1 else priors
         fits = calibrate(stepper, z, [()] * _STARTS, held, window, 40)
-    order = np.argsort(np.where(np.isfinite(fits.cost), _likelihood(problem, fits, short[-1]), np.inf))
+    ranked = np.argsort(np.where(np.isfinite(fits.cost), _likelihood(problem, fits, short[-1]), np.inf))
+    apart, alike = _apart_first(fits.z[ranked, : problem.head])
+    order = ranked[[*apart, *alike]]
     z = np.stack([without_turns(problem, z) for z in fits.z[order]])
     return Fits([()] * _STARTS, z, fits.noise[order], [], fits.cost[order], fits.converged[order])
 
@@ -78,8 +84,10 @@ def _tried(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Float[np.nd
     """Where the first fits begin: half as drawn, half those of many draws that follow a few rows best as they are."""
     drawn = _scattered(stepper.problem, priors)
     predictions = stepper.predict(drawn, [()] * _DRAWN, rows)
-    best = _recombined(stepper.problem, drawn, predictions, rows)
-    return np.concatenate([best[: _TRIED // 2], drawn[: _TRIED // 2]])
+    half = _TRIED // 2
+    side_by_side = [(k,) * len(rows) for k in range(half)]
+    best = _joined(stepper.problem, drawn, _ranked(stepper.problem, predictions, rows), side_by_side)
+    return np.concatenate([best, drawn[:half]])
 
 
 def _scattered(problem: Problem, priors: Priors) -> Float[np.ndarray, "lane z"]:
@@ -123,18 +131,70 @@ def _is_unread_angle(problem: Problem, r: int, z: np.ndarray, x: np.ndarray, i: 
 def _recombined(
     problem: Problem, lanes: Float[np.ndarray, "lane z"], predictions: list[Predictions], rows: Sequence[int]
 ) -> Float[np.ndarray, "lane z"]:
-    """Lanes of which the first begins every recording where that one is followed best, the next one second best..."""
-    weight = weights(problem, rows)
-    z = lanes.copy()
-    for r, (x, w) in enumerate(zip(residuals(problem, predictions, weight), weight, strict=True)):
+    """Lanes of which the first begins every recording where that one is followed best, the next ones where it is
+    followed next best from elsewhere, in one recording or several.
+
+    Of two starts that mirror each other a few rows of one recording tell little; all rows of all of them tell which
+    belong together.
+    """
+    orders, apart = [], []
+    for r, order in enumerate(_ranked(problem, predictions, rows)):
+        first, others = _apart_first(lanes[order, r * problem.state : (r + 1) * problem.state])
+        orders.append(order[[*first, *others]])
+        apart.append(len(first))
+    return _joined(problem, lanes, orders, _ranks(apart, len(lanes)))
+
+
+def _ranked(problem: Problem, predictions: list[Predictions], rows: Sequence[int]) -> list[Int[np.ndarray, " lane"]]:
+    """Lanes of every recording, those that follow it best first."""
+    weight, out = weights(problem, rows), []
+    for x, w in zip(residuals(problem, predictions, weight), weight, strict=True):
         number = (w > 0).sum(0)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             misfit = (number * np.log((w * x**2).sum(1) / np.maximum(number, 1))).sum(1)
-        order = np.argsort(np.where(np.isnan(misfit), np.inf, misfit))
-        # The calibrated values, which were hardly free yet, come with the first recording.
+        out.append(np.argsort(np.where(np.isnan(misfit), np.inf, misfit)))
+    return out
+
+
+def _joined(
+    problem: Problem, lanes: np.ndarray, orders: Sequence[np.ndarray], ranks: Sequence[Sequence[int]]
+) -> Float[np.ndarray, "lane z"]:
+    """Lanes that begin each recording as the one of some rank does. The calibrated values, which were hardly free yet,
+    come with the first recording."""
+    z = lanes[: len(ranks)].copy()
+    for r, order in enumerate(orders):
         own = slice(r * problem.state, (r + 1) * problem.state if r else problem.size)
-        z[:, own] = lanes[order, own]
+        z[:, own] = lanes[order[[one[r] for one in ranks]], own]
     return z
+
+
+def _apart_first(x: Float[np.ndarray, "lane state"]) -> tuple[list[int], list[int]]:
+    """Which states lie apart from all before them, and the others."""
+    finite = x[np.isfinite(x).all(1)]
+    near = _ALIKE * np.quantile(np.abs(finite), _LARGE, axis=0) if len(finite) else np.zeros(x.shape[1])
+    apart: list[int] = []
+    for k, one in enumerate(x):
+        with np.errstate(invalid="ignore"):
+            if not (np.abs(one - x[apart]) <= near).all(1).any():
+                apart.append(k)
+    return apart, [k for k in range(len(x)) if k not in apart]
+
+
+def _ranks(numbers: Sequence[int], lanes: int) -> list[tuple[int, ...]]:
+    """Which of its starts every recording takes, for so many lanes: those of the smallest sums of ranks; then, where
+    all have been taken together, rank by rank."""
+    sums = itertools.count()
+    out: list[tuple[int, ...]] = []
+    while len(out) < min(lanes, math.prod(numbers)):
+        out += _summing(numbers, next(sums))
+    return [*out, *((k,) * len(numbers) for k in range(len(out), lanes))][:lanes]
+
+
+def _summing(numbers: Sequence[int], total: int) -> list[tuple[int, ...]]:
+    """Ranks, each below its number, of one sum."""
+    if len(numbers) == 1:
+        return [(total,)] if total < numbers[0] else []
+    return [(k, *rest) for k in range(min(total + 1, numbers[0])) for rest in _summing(numbers[1:], total - k)]
 
 
 def _tightened(problem: Problem, priors: Priors) -> Priors:
