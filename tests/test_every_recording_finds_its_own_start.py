@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from symplearn.diagnosis import _start as begin
+from symplearn.diagnosis._sizes import sizes_of_motion
 from symplearn.diagnosis._start import first_fits, priors_without_effects, without_turns
 from symplearn.diagnosis._trajectory import Stepper
 
@@ -117,6 +118,32 @@ def test_an_orbit_of_which_one_coordinate_is_read_finds_its_start():
         # Five standard errors of 24 rows, by the fit's own slopes: 0.005 at most along x, 0.009 along y.
         assert (x, px) == pytest.approx((start[0], start[2]), abs=0.025)
         assert (side * y, side * py) == pytest.approx((start[1], start[3]), abs=0.045)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e6])
+def test_a_start_is_found_in_any_unit(unit):
+    """Two coupled circuits, one with a varactor, of which one voltage is read, in microseconds by DOP853; their charges
+    count in nanocoulombs, or in anything else: sizes of charges and fluxes are right within a factor of ten, and the
+    best lane follows what is read."""
+
+    def rates(t, x):
+        qa, qb, fa, fb = x
+        return [fa, fb / 1.2, -qa - 0.04 * qa**2 - 0.2 * (qa - qb), -qb / 0.9 + 0.2 * (qa - qb)]
+
+    times = np.arange(240) * 0.3
+    path = cases.solved(rates, [1.3, -0.4, 0.0, 0.8], times)
+    read = path[:, 0] + 0.04 * path[:, 0] ** 2 + 0.02 * np.random.default_rng(5).normal(size=240)
+    energy = "fa**2/(2*La) + fb**2/(2*Lb) + qa**2/(2*Ca) + al*qa**3/3 + qb**2/(2*Cb) + (qa - qb)**2/(2*Cc)"
+    more = f"[parameters]\nCa = {unit}\nCb = {0.9 * unit}\nCc = {5 * unit}\nal = {0.04 / unit**2}\n"
+    more += f"La = {1e-12 / unit}\nLb = {1.2e-12 / unit}\n[recording.noise]\nva = 0.02"
+    file = cases.simulation(energy, ("qa", "qb"), ("fa", "fb"), {"va": "qa/Ca + al*qa**2"}, more)
+    path, times = path * [unit, unit, 1e-6, 1e-6], 1e-6 * times
+    problem = cases.problem(file, [cases.recorded(times, read, columns=("va",))], 1e-7)
+    priors, width = priors_without_effects(problem), problem.equations.width
+    size = sizes_of_motion(problem, priors.mean, 0)[[0, 1, width, width + 1]]
+    assert (np.abs(np.log10(size / np.sqrt(np.mean(path**2, axis=0)))) < 1.0).all()
+    found = first_fits(Stepper(problem), priors, [240])
+    assert found.cost[0] < 51  # a chi-squared of 24 readings exceeds it once in a thousand times
 
 
 RINGS = ((1.1, 0.0, 0.3, 1.5), (-0.4, 0.9, -1.3, -0.2))

@@ -12,11 +12,14 @@ from ._along import along, along_all, force, readings, velocity
 from ._calibrate import Fits, Priors, calibrate, residuals, weights
 from ._motion import rms
 from ._problem import Problem
+from ._sizes import sizes_of_motion
 from ._trajectory import Predictions, Stepper
 
 # Initial states drawn, starts tried over a few rows, those of them that are followed on, and how far they are spread.
 _DRAWN, _TRIED, _STARTS = 1024, 64, 16
 _SPREADS = (1e-3, 0.1, 1.0, 10.0)
+# Beyond these sizes of a component of the phase point spreads count in that size.
+_SMALL, _BIG = 1e-3, 1e2
 # Rows of the first windows, at least so many.
 _SHORT = (8, 14)
 # Where nothing is known: this many times the size of what was found.
@@ -98,8 +101,16 @@ def _scattered(problem: Problem, priors: Priors) -> Float[np.ndarray, "lane z"]:
     noise = rng.normal(size=(_DRAWN, problem.head))
     given = np.tile(np.where(np.isfinite(problem.initial.sd), problem.initial.sd, 0.0), len(problem.rows))
     unknown = np.tile(np.isinf(problem.initial.sd), len(problem.rows))
-    z[:, : problem.head] += np.where(unknown, noise * spread[:, None], given * noise)
+    size = np.concatenate([_unit_sizes(problem, priors, r) for r in range(len(problem.rows))])
+    z[:, : problem.head] += np.where(unknown, noise * size * spread[:, None], given * noise)
     return z
+
+
+def _unit_sizes(problem: Problem, priors: Priors, r: int) -> Float[np.ndarray, " state"]:
+    """What a start is counted in: one, where spreads of all sizes reach it; else the size of the motion."""
+    size = sizes_of_motion(problem, priors.mean, r)
+    with np.errstate(invalid="ignore"):
+        return np.where((size < _SMALL) | (size > _BIG), size, 1.0)
 
 
 def without_turns(problem: Problem, z: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:

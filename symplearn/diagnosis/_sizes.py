@@ -1,0 +1,77 @@
+"""How large a motion may be, from what is read: coordinates in nanocoulombs, momenta in kilogrammes times kilometres.
+
+A coordinate is as large as moves a reading by what the readings vary; a momentum moves its coordinate by that in the
+time in which they do; and what is not read has as much kinetic energy as what is.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from ._along import What, along, readings, velocity
+from ._problem import Problem
+
+# Displacements that are tried.
+_TRIED = np.geomspace(1e-15, 1e15, 31)
+# A displacement shows that moves a reading by this share of what the readings vary.
+_SHOWN = 0.3
+
+
+@np.errstate(all="ignore")  # what is not finite far out is left out
+def sizes_of_motion(problem: Problem, z: Float[np.ndarray, " z"], r: int) -> Float[np.ndarray, " state"]:
+    """Size of every component of the phase point in its own unit, NaN where the recording does not tell.
+
+    **Arguments:** - `z`: the unknowns, at their prior means. - `r`: the recording, from 0.
+    """
+    own, width, d = slice(r * problem.state, (r + 1) * problem.state), problem.equations.width, problem.equations.dim
+    begin, out = z[own], np.full(problem.state, np.nan)
+    vary, time = _variation(problem, r)
+    shown = np.stack([_shown(_moved(problem, readings, r, z, begin, i), vary) for i in range(problem.state)])
+    pace = np.array([_slope(_moved(problem, velocity, r, z, begin, width + i)[:, i]) for i in range(d)])
+    out[:d], out[width : width + d] = shown[:d], shown[width : width + d]
+    q, p = out[:d], out[width : width + d]
+    energy = _middle(np.concatenate([q**2 / (time**2 * pace), p**2 * pace]))
+    out[:d] = np.where(np.isfinite(q), q, np.sqrt(energy * pace) * time)
+    out[width : width + d] = np.where(np.isfinite(p), p, out[:d] / (time * pace))
+    return out
+
+
+def _variation(problem: Problem, r: int) -> tuple[Float[np.ndarray, " channel"], float]:
+    """How much every channel varies, and in what time."""
+    rows = problem.rows[r]
+    y, t = rows.readings[: rows.fitted], rows.times[: rows.fitted]
+    vary, times = np.full(y.shape[1], np.nan), []
+    for j, column in enumerate(y.T):
+        seen = np.isfinite(column)
+        if seen.sum() > 2:
+            vary[j] = np.std(column[seen])
+            times.append(vary[j] / np.sqrt(np.mean((np.diff(column[seen]) / np.diff(t[seen])) ** 2)))
+    return vary, _middle(np.array(times))
+
+
+def _moved(
+    problem: Problem, what: What, r: int, z: np.ndarray, begin: np.ndarray, i: int
+) -> Float[np.ndarray, "tried value"]:
+    """What changes where one component of the phase point is displaced by what is tried."""
+    unit, most, parts = np.arange(problem.state) == i, max(len(one.times) for one in problem.rows), []
+    for some in np.array_split(_TRIED, -(-len(_TRIED) // most)):
+        there = along(problem, what, r, z, (), begin + some[:, None] * unit)
+        parts.append(there - along(problem, what, r, z, (), np.tile(begin, (len(some), 1))))
+    return np.concatenate(parts)
+
+
+def _shown(moved: Float[np.ndarray, "tried channel"], vary: Float[np.ndarray, " channel"]) -> float:
+    """The smallest displacement that shows."""
+    enough = (np.abs(moved) > _SHOWN * vary).any(1)
+    return float(_TRIED[enough.argmax()]) if enough.any() else np.nan
+
+
+def _slope(moved: Float[np.ndarray, " tried"]) -> float:
+    """What changes by what is displaced, where it changes most evenly: in the middle of what is finite."""
+    slopes = np.abs(moved) / _TRIED
+    return _middle(slopes[slopes > 0])
+
+
+def _middle(values: Float[np.ndarray, " value"]) -> float:
+    """The median of what is finite, NaN where nothing is."""
+    some = values[np.isfinite(values)]
+    return float(np.median(some)) if len(some) else np.nan
