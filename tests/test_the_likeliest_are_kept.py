@@ -90,6 +90,37 @@ def test_what_is_left_of_a_triple_is_weighed_down_to_one(damped):
     damped.found.estimates.update(before)
 
 
+@pytest.mark.slow
+def test_what_stopped_at_another_time_begins_where_its_part_did():
+    """A blow and a stiffness, fitted with the blow at a time when there was none, are less likely than the blow alone;
+    begun at its time they are likelier by far, and have it there."""
+    struck, at = lambda t, x: [x[1], -x[0] - 0.1 * x[0] ** 2], 13.3
+    first, second = TIMES[at > TIMES], np.append(at, TIMES[at < TIMES])
+    before = cases.solved(struck, [1.0, 0.0], np.append(first, at))
+    after = cases.solved(struck, before[-1] + [0.0, 0.4], second)
+    q = np.concatenate([before[:-1, 0], after[1:, 0]]) + 0.01 * np.random.default_rng(1).normal(size=len(TIMES))
+    stepper = Stepper(cases.problem(cases.simulation("p**2/2 + q**2/2"), [cases.recorded(TIMES, q)], 0.1))
+    p = stepper.problem
+    seeds = first_fits(stepper, priors_without_effects(p), [r.fitted for r in p.rows])
+    search = Search(stepper, seeds.z, np.inf, lambda message: None)
+    search._begin()
+    blow, stiffness = member(search, "impulse"), member(search, "quadratic_stiffness")
+    pair = tuple(sorted((blow, stiffness)))
+
+    def begun(combination, time):
+        z, where = search._from_seed(), dict(p.placed(combination))
+        z[where[blow]] = 0.1, time
+        return Start(combination, z, 0.0)
+
+    search.weigher.weigh([begun((blow,), at), begun(pair, 4.0)], whole=True)
+    wrong, part = search.found.of(pair, "white"), search.found.of((blow,), "white")
+    assert wrong.log_evidence < part.log_evidence - 10
+    Refinement(search.prospects, search.progress).weigh_grown()
+    right, place = search.found.of(pair, "white"), dict(p.placed(pair))[blow]
+    assert right.log_evidence > part.log_evidence + 10
+    assert right.z[place.stop - 1] == pytest.approx(at, abs=0.2)
+
+
 def test_a_path_that_was_thrown_out_sets_no_scale():
     """A path that has not settled and leads a thousand times as far as the motion is passed over for the best
     trajectory; one that has settled is not."""

@@ -1,4 +1,5 @@
-"""The best combinations weighed once more: with their places moved, beside what may do as well, and less one member."""
+"""The best combinations weighed once more: with their places moved, beside what may do as well, and with a member more
+or less."""
 
 from collections.abc import Callable, Sequence
 
@@ -18,6 +19,8 @@ from ._weigher import KEPT, Weigher
 _MOVED, _NEAR = 3, 8.0
 # How far behind the best of its size one with an unseen oscillator may be to be tried stiffer, and starts of such.
 _SOFT, _STIFFER = 100.0, 20
+# Standard deviations between places of one effect in two fits that stopped at different ones.
+_ELSEWHERE = 3.0
 # Combinations like the best of a size that are fitted, and how far behind a regression may see them.
 _ALIKE, _BEHIND = 8, 30.0
 
@@ -111,6 +114,18 @@ class Refinement:
             found += [*mine[:1], *seen[:1]]
         return list(dict.fromkeys(found))
 
+    def weigh_grown(self) -> None:
+        """Combinations that are less likely than one of their own parts which has an effect elsewhere, at another time,
+        threshold or frequency, from there: what lacks a member was pulled astray, what has it is not."""
+        ranked = sorted(self._mine(), key=self.found.odds, reverse=True)
+        starts: dict[Combination, Start] = {}
+        for part in ranked[:KEPT]:
+            grown = [c for c in ranked if len(c) == len(part) + 1 and set(part) < set(c)]
+            new = [c for c in grown if c not in starts and self._is_elsewhere(c, part)]
+            starts |= {c: Start(c, self._grown(c, part), 0.0) for c in new}
+        if starts:
+            self.weigher.weigh(list(starts.values())[: 2 * KEPT], whole=True)
+
     def weigh_subsets(self) -> None:
         """What the best combinations become without each of their members, from where they are, and what becomes of
         those: what was weighed already may have been caught in a poorer optimum, which would make the member look
@@ -150,6 +165,29 @@ class Refinement:
         """Whether one member more is worth something."""
         larger = [self.found.best(c) for c in ranked if set(combination) < set(c)]
         return self.found.best(combination) < max(larger)
+
+    def _is_elsewhere(self, combination: Combination, part: Combination) -> bool:
+        """Whether an effect of a part has its place elsewhere there, and does better without the rest."""
+        mine, other = self.found.of(combination, "white"), self.found.of(part, "white")
+        if mine is None or other is None or mine.log_evidence >= other.log_evidence:
+            return False
+        where = dict(self.problem.placed(combination))
+        for member, place in self.problem.placed(part):
+            k = place.stop - 1
+            apart = abs(mine.z[where[member].stop - 1] - other.z[k])
+            if self.problem.candidate(member).effect.places and apart > _ELSEWHERE * np.sqrt(other.covariance[k, k]):
+                return True
+        return False
+
+    def _grown(self, combination: Combination, part: Combination) -> np.ndarray:
+        """Where a combination begins at a part's values: what is new in it at its own."""
+        mine, other = self.found.of(combination, "white"), self.found.of(part, "white")
+        assert mine is not None and other is not None
+        z, where = other.z.copy(), dict(self.problem.placed(part))
+        z[self.problem.slots :] = 0.0
+        for member, place in self.problem.placed(combination):
+            z[place] = other.z[where[member]] if member in where else mine.z[place]
+        return z
 
     def _shrunk(self, combination: Combination, ranked: Sequence[Combination]) -> np.ndarray:
         """Where a combination begins that lacks one member of a fitted one: at that one's values."""

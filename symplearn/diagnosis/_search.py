@@ -216,7 +216,7 @@ class Search:
 
     def _refine(self) -> None:
         """The best once more from elsewhere, with what may do as well, and with what is left without a member."""
-        for part in (self.refinement.move_places, self.refinement.weigh_like_the_best):
+        for part in (self.refinement.move_places, self.refinement.weigh_like_the_best, self.refinement.weigh_grown):
             if self._in_time():
                 part()
         self.refinement.weigh_subsets()
