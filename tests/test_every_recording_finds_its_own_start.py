@@ -146,6 +146,17 @@ def test_a_start_is_found_in_any_unit(unit):
     assert found.cost[0] < 51  # a chi-squared of 24 readings exceeds it once in a thousand times
 
 
+def test_a_column_that_never_changes_says_nothing_of_sizes():
+    """Of a spring and a column that stays at zero the size is that of the other column; of two such it is open."""
+    swinging = np.stack([3e-7 * np.cos(TIMES), 0 * TIMES], axis=1)
+    file = cases.simulation("p**2/2 + q**2/2", observe={"y": "q", "z": "p"})
+    for readings, expected in ((swinging, [1e-7, 1e-7]), (0 * swinging, [np.nan, np.nan])):
+        problem = cases.problem(file, [cases.recorded(TIMES, readings, columns=("y", "z"))], 0.25)
+        size = sizes_of_motion(problem, np.zeros(problem.size), 0)[[0, problem.equations.width]]
+        # Decades are tried, and the first one that shows is taken; a momentum goes by how fast the readings change.
+        np.testing.assert_allclose(np.log10(size), np.log10(expected), atol=0.5)
+
+
 RINGS = ((1.1, 0.0, 0.3, 1.5), (-0.4, 0.9, -1.3, -0.2))
 
 

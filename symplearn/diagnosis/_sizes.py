@@ -36,13 +36,13 @@ def sizes_of_motion(problem: Problem, z: Float[np.ndarray, " z"], r: int) -> Flo
 
 
 def _variation(problem: Problem, r: int) -> tuple[Float[np.ndarray, " channel"], float]:
-    """How much every channel varies, and in what time."""
+    """How much every channel varies, NaN where it does not, and in what time."""
     rows = problem.rows[r]
     y, t = rows.readings[: rows.fitted], rows.times[: rows.fitted]
     vary, times = np.full(y.shape[1], np.nan), []
     for j, column in enumerate(y.T):
         seen = np.isfinite(column)
-        if seen.sum() > 2:
+        if seen.sum() > 2 and np.ptp(column[seen]) > 0:
             vary[j] = np.std(column[seen])
             times.append(vary[j] / np.sqrt(np.mean((np.diff(column[seen]) / np.diff(t[seen])) ** 2)))
     return vary, _middle(np.array(times))
