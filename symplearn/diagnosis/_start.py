@@ -26,6 +26,8 @@ _SHORT = (8, 14)
 _WIDE = 10.0
 # Starts that differ by less than this share of their size are one; a size that few of them exceed.
 _ALIKE, _LARGE = 0.05, 0.9
+# Starts are tried for lying apart that are behind the best by so many nats at most.
+_HOPELESS = 15.0
 # Relative round-off of forces a whole turn on.
 _ROUND_OFF = 1e-9
 
@@ -76,8 +78,10 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
         z = _recombined(problem, fits.z, fits.predictions, short[number - 1])[:_STARTS]
         held = tight if number < len(_SHORT) + 1 else priors
         fits = calibrate(stepper, z, [()] * _STARTS, held, window, 40)
-    ranked = np.argsort(np.where(np.isfinite(fits.cost), _likelihood(problem, fits, short[-1]), np.inf))
-    apart, alike = _apart_first(fits.z[ranked, : problem.head])
+    value = np.where(np.isfinite(fits.cost), _likelihood(problem, fits, short[-1]), np.inf)
+    ranked = np.argsort(value)
+    near = int((value[ranked] <= value[ranked[0]] + 2 * _HOPELESS * len(rows)).sum())
+    apart, alike = _apart_first(fits.z[ranked, : problem.head], near)
     order = ranked[[*apart, *alike]]
     z = np.stack([without_turns(problem, z) for z in fits.z[order]])
     return Fits([()] * _STARTS, z, fits.noise[order], [], fits.cost[order], fits.converged[order])
@@ -89,7 +93,8 @@ def _tried(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Float[np.nd
     predictions = stepper.predict(drawn, [()] * _DRAWN, rows)
     half = _TRIED // 2
     side_by_side = [(k,) * len(rows) for k in range(half)]
-    best = _joined(stepper.problem, drawn, _ranked(stepper.problem, predictions, rows), side_by_side)
+    orders = [order for order, _ in _ranked(stepper.problem, predictions, rows)]
+    best = _joined(stepper.problem, drawn, orders, side_by_side)
     return np.concatenate([best, drawn[:half]])
 
 
@@ -149,21 +154,25 @@ def _recombined(
     belong together.
     """
     orders, apart = [], []
-    for r, order in enumerate(_ranked(problem, predictions, rows)):
-        first, others = _apart_first(lanes[order, r * problem.state : (r + 1) * problem.state])
+    for r, (order, misfit) in enumerate(_ranked(problem, predictions, rows)):
+        near = int((misfit[order] <= misfit[order[0]] + 2 * _HOPELESS).sum())
+        first, others = _apart_first(lanes[order, r * problem.state : (r + 1) * problem.state], near)
         orders.append(order[[*first, *others]])
         apart.append(len(first))
     return _joined(problem, lanes, orders, _ranks(apart, len(lanes)))
 
 
-def _ranked(problem: Problem, predictions: list[Predictions], rows: Sequence[int]) -> list[Int[np.ndarray, " lane"]]:
-    """Lanes of every recording, those that follow it best first."""
+def _ranked(
+    problem: Problem, predictions: list[Predictions], rows: Sequence[int]
+) -> list[tuple[Int[np.ndarray, " lane"], Float[np.ndarray, " lane"]]]:
+    """Lanes of every recording, those that follow it best first, and minus twice the profile likelihood of each."""
     weight, out = weights(problem, rows), []
     for x, w in zip(residuals(problem, predictions, weight), weight, strict=True):
         number = (w > 0).sum(0)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             misfit = (number * np.log((w * x**2).sum(1) / np.maximum(number, 1))).sum(1)
-        out.append(np.argsort(np.where(np.isnan(misfit), np.inf, misfit)))
+        misfit = np.where(np.isnan(misfit), np.inf, misfit)
+        out.append((np.argsort(misfit), misfit))
     return out
 
 
@@ -179,14 +188,14 @@ def _joined(
     return z
 
 
-def _apart_first(x: Float[np.ndarray, "lane state"]) -> tuple[list[int], list[int]]:
-    """Which states lie apart from all before them, and the others."""
+def _apart_first(x: Float[np.ndarray, "lane state"], near: int) -> tuple[list[int], list[int]]:
+    """Which of so many leading states lie apart from all before them, and the others."""
     finite = x[np.isfinite(x).all(1)]
-    near = _ALIKE * np.quantile(np.abs(finite), _LARGE, axis=0) if len(finite) else np.zeros(x.shape[1])
+    alike = _ALIKE * np.quantile(np.abs(finite), _LARGE, axis=0) if len(finite) else np.zeros(x.shape[1])
     apart: list[int] = []
-    for k, one in enumerate(x):
+    for k, one in enumerate(x[:near]):
         with np.errstate(invalid="ignore"):
-            if not (np.abs(one - x[apart]) <= near).all(1).any():
+            if not (np.abs(one - x[apart]) <= alike).all(1).any():
                 apart.append(k)
     return apart, [k for k in range(len(x)) if k not in apart]
 
