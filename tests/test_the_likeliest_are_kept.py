@@ -118,7 +118,7 @@ def test_what_stopped_at_another_time_begins_where_its_part_did():
     Refinement(search.prospects, search.progress).weigh_grown()
     right, place = search.found.of(pair, "white"), dict(p.placed(pair))[blow]
     assert right.log_evidence > part.log_evidence + 10
-    assert right.z[place.stop - 1] == pytest.approx(at, abs=0.2)
+    assert right.z[place.stop - 1] == pytest.approx(at, abs=0.2)  # rows are 0.17 apart. Seen: 0.002
 
 
 def test_a_path_that_was_thrown_out_sets_no_scale():

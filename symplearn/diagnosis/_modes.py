@@ -23,7 +23,7 @@ from ._weigher import Weigher
 _SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
 # How many of its prior's standard deviations a calibrated value may be moved.
 _REACH = 3.0
-# Of a phase point's rates, for the rate of a force.
+# Of the time between two rows, for the rate of a force.
 _STEP = 1e-6
 
 
@@ -67,9 +67,9 @@ def _with_starts(
 ) -> Float[np.ndarray, " z"]:
     """With what the unseen one pushes at the first row, and its rate, so that the seen one is pushed as before."""
     for r in problem.members[member].recordings:
-        first = paths[r][:1]
-        ahead = np.concatenate([first, first + _STEP * along(problem, rates, r, z, combination, first)])
+        first, step = paths[r][:1], _STEP * float(np.median(np.diff(problem.rows[r].times)))
+        ahead = np.concatenate([first, first + step * along(problem, rates, r, z, combination, first)])
         before, after = (along(problem, force, r, some, (), ahead) for some in (z, moved))
         less = (before - after)[:, problem.candidate(member).place]
-        moved[problem.unseen(r)] += less[0], (less[1] - less[0]) / _STEP
+        moved[problem.unseen(r)] += less[0], (less[1] - less[0]) / step
     return moved

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ._along import along_all, force, readings, velocity
 from ._problem import Problem
 
-# Of a parameter, for the derivative of a force that hangs on it smoothly.
+# Of a parameter's own size, for the derivative of a force that hangs on it smoothly.
 _STEP = 1e-6
 
 
@@ -85,7 +85,7 @@ def stiffening(
     """What the stiffness of each coordinate along given paths changes by, per unit of each calibrated parameter."""
     here, out = stiffness(problem, z, paths), []
     for k in range(problem.head, problem.head + problem.calibrated.parameters):
-        moved, step = z.copy(), _STEP * max(abs(z[k]), 1.0)
+        moved, step = z.copy(), _STEP * (abs(z[k]) or 1.0)
         moved[k] += step
         out.append((stiffness(problem, moved, paths) - here) / step)
     return np.reshape(out, (-1, problem.equations.dim)).T

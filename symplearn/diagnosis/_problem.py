@@ -130,6 +130,17 @@ class Problem:
             first += self.candidate(member).effect.size
         return out
 
+    def carried(
+        self, z: Float[np.ndarray, " z"], before: Combination, combination: Combination
+    ) -> Float[np.ndarray, " z"]:
+        """The unknowns of one combination as those of another: members of both keep their values, new ones are zero."""
+        out, where = z.copy(), dict(self.placed(before))
+        out[self.slots :] = 0.0
+        for member, place in self.placed(combination):
+            if member in where:
+                out[place] = z[where[member]]
+        return out
+
     def is_possible(self, combination: Sequence[int]) -> bool:
         """Whether a combination can be simulated: each effect and target once, at most one unseen oscillator."""
         whole = {self.whole(member) for member in combination}

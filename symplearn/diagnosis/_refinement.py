@@ -115,8 +115,8 @@ class Refinement:
         return list(dict.fromkeys(found))
 
     def weigh_grown(self) -> None:
-        """Combinations that are less likely than one of their own parts which has an effect elsewhere, at another time,
-        threshold or frequency, from there: what lacks a member was pulled astray, what has it is not."""
+        """Combinations that are less likely than a part of their own, with an effect at another time, threshold or
+        frequency than that has it, from the part's fit: they stopped at a poorer optimum."""
         ranked = sorted(self._mine(), key=self.found.odds, reverse=True)
         starts: dict[Combination, Start] = {}
         for part in ranked[:KEPT]:
@@ -183,10 +183,10 @@ class Refinement:
         """Where a combination begins at a part's values: what is new in it at its own."""
         mine, other = self.found.of(combination, "white"), self.found.of(part, "white")
         assert mine is not None and other is not None
-        z, where = other.z.copy(), dict(self.problem.placed(part))
-        z[self.problem.slots :] = 0.0
+        z = self.problem.carried(other.z, part, combination)
         for member, place in self.problem.placed(combination):
-            z[place] = other.z[where[member]] if member in where else mine.z[place]
+            if member not in part:
+                z[place] = mine.z[place]
         return z
 
     def _shrunk(self, combination: Combination, ranked: Sequence[Combination]) -> np.ndarray:
@@ -194,8 +194,4 @@ class Refinement:
         larger = next(c for c in ranked if set(combination) < set(c))
         white = self.found.of(larger, "white")
         assert white is not None
-        z, where = white.z.copy(), dict(self.problem.placed(larger))
-        z[self.problem.slots :] = 0.0
-        for member, place in self.problem.placed(combination):
-            z[place] = white.z[where[member]]
-        return z
+        return self.problem.carried(white.z, larger, combination)

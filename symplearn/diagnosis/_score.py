@@ -195,11 +195,6 @@ def _unseen_strength(
 
 def placed(problem, z, combination, larger, member, amplitudes, unit: Unit) -> np.ndarray:
     """Unknowns and old effects as they are in z, and the new effect of given amplitudes at the unit's place."""
-    old, out = dict(problem.placed(combination)), z.copy()
-    out[problem.slots :] = 0.0
-    for m, place in problem.placed(larger):
-        if m == member:
-            out[place] = np.append(amplitudes, [] if unit.place is None else [unit.place])
-        else:
-            out[place] = z[old[m]]
-    return out
+    out = problem.carried(z, combination, larger)
+    out[dict(problem.placed(larger))[member]] = np.append(amplitudes, [] if unit.place is None else [unit.place])
+    return np.asarray(out)

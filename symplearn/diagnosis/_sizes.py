@@ -52,10 +52,11 @@ def _moved(
     problem: Problem, what: What, r: int, z: np.ndarray, begin: np.ndarray, i: int
 ) -> Float[np.ndarray, "tried value"]:
     """What changes where one component of the phase point is displaced by what is tried."""
+    # Functions are mapped over as many points as the longest recording has rows.
     unit, most, parts = np.arange(problem.state) == i, max(len(one.times) for one in problem.rows), []
     for some in np.array_split(_TRIED, -(-len(_TRIED) // most)):
-        there = along(problem, what, r, z, (), begin + some[:, None] * unit)
-        parts.append(there - along(problem, what, r, z, (), np.tile(begin, (len(some), 1))))
+        there, here = (along(problem, what, r, z, (), begin + size[:, None] * unit) for size in (some, 0 * some))
+        parts.append(there - here)
     return np.concatenate(parts)
 
 

@@ -221,7 +221,8 @@ def _tightened(problem: Problem, priors: Priors) -> Priors:
     """Calibrated values held near their starting values while the initial states are found."""
     precision = priors.precision.copy()
     part = slice(problem.head, problem.head + problem.calibrated.size)
-    scale = 1e-3 * np.maximum(np.abs(problem.calibrated.mean), 1e-6)
+    mean = np.abs(problem.calibrated.mean)
+    scale = 1e-3 * np.where(mean > 0, mean, 1e-6)
     precision[part] = np.maximum(precision[part], scale**-2.0)
     return replace(priors, precision=precision)
 

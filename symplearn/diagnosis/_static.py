@@ -96,8 +96,8 @@ def _candidate(problem: Problem, power: int, place: int) -> int:
 def _families(q: Float[np.ndarray, " row"]) -> list[Float[np.ndarray, "amplitude power"]]:
     """Shapes of a force over the range of a motion: all, and those of a force that is odd in the coordinate.
 
-    A wrong geometry mostly keeps the symmetry that the right one has. Even shapes, which are not there, would then cost
-    as much as the data are sure of that.
+    A wrong geometry may keep the symmetry that the right one has; even shapes, which it then lacks, would cost as much
+    as the data are sure of that.
     """
     reach = float(np.abs(q).max())
     odd = np.arange(len(_FORCES)) % 2 == 1
