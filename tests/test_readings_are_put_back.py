@@ -80,7 +80,8 @@ def test_outliers_are_far_off(said, size, doubtful):
     ids=["likelier without them", "likelier with them", "no clear remainder"],
 )
 def test_outliers_beside_a_clear_remainder_are_tried_without(monkeypatch, ahead_of_white, without, answer):
-    """They may be a part of it: the likelier of both searches is the answer. Without a remainder one search is enough.
+    """They may be a part of it: the likelier of both searches is the answer, and what the other one weighed stands by.
+    Without a remainder one search is enough.
 
     An electronic Duffing oscillator had outliers in the place of an offset, which an error of the clock took with it.
     """
@@ -109,3 +110,5 @@ def test_outliers_beside_a_clear_remainder_are_tried_without(monkeypatch, ahead_
     monkeypatch.setattr(_find, "Search", Searching)
     found = _find._run(Stepper(p, 1), np.zeros((1, p.size)), 0.0, Options(progress=lambda said: None))
     assert found.base == ((outliers,) if answer == "with" else ())
+    assert max(found.found.estimates, key=found.found.odds) == found.base
+    assert set(found.found.estimates) == ({(outliers,)} if ahead_of_white < 10.0 else {(outliers,), ()})

@@ -65,14 +65,19 @@ def searched(
 def _run(stepper: Stepper, seeds: np.ndarray, deadline: float, options: Options) -> Search:
     """Search with outliers taken out; anew with those of a column left in that turn out to be none: what the simulation
     misses of a motion may look like outliers of a path that follows it, and takes their places in a combination. Beside
-    a clear remainder they may be a part of it: there the likelier one of both searches is the answer."""
+    a clear remainder they may be a part of it: there the likelier one of both searches is the answer. What the other
+    one weighed stays beside it."""
     spared: frozenset[int] = frozenset()
     rival: Search | None = None
+    before: Found | None = None
     while True:
         search = Search(stepper, seeds, deadline, options.progress, spared)
         found = search.run()
         if rival is not None and _most(rival.found) >= _most(found):
+            rival.found.stand_by(found)
             return rival
+        if before is not None:
+            found.stand_by(before)
         best = speaker(found.estimates[max(found.estimates, key=found.odds)])
         doubtful, rival = doubtful_outliers(search.problem, search.base, best), None
         if not doubtful and _is_clear(found, best):
@@ -80,7 +85,7 @@ def _run(stepper: Stepper, seeds: np.ndarray, deadline: float, options: Options)
         if not doubtful or not found.complete:
             return search
         options.progress("leaving readings in that are no outliers")
-        spared |= doubtful
+        spared, before = spared | doubtful, found
 
 
 def _most(found: Found) -> float:

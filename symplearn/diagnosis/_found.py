@@ -117,6 +117,13 @@ class Found:
                     return True
         return False
 
+    def stand_by(self, other: "Found") -> None:
+        """Keep what another search weighed and this one did not, as far as it is less likely than the best here."""
+        top = max(map(self.odds, self.estimates))
+        for combination, estimates in other.estimates.items():
+            if combination not in self.estimates and other.odds(combination) < top:
+                self.estimates[combination] = estimates
+
     def of(self, combination: Combination, kind: str) -> Estimate | None:
         """The estimate of a combination under one kind of remainder, None where there is none."""
         return next((e for e in self.estimates.get(combination, []) if e.kind == kind), None)

@@ -222,8 +222,8 @@ class Search:
         self.refinement.weigh_subsets()
 
     def _is_mine(self, combination: Combination) -> bool:
-        """Whether the outliers that were taken out are part of it."""
-        return set(self.base) <= set(combination)
+        """Whether the outliers that were taken out are part of it, and no others."""
+        return {m for m in combination if self.problem.candidate(m).effect is OUTLIERS} == set(self.base)
 
     def _size(self, combination: Combination) -> int:
         """Effects beside outliers that are taken out."""
