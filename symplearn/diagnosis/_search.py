@@ -39,8 +39,9 @@ _BATCH = 32
 _SIMPLE = 2
 # Combinations that are weighed again in finer steps, or beside a force that goes with place.
 _AGAIN = 24
-# Of each size, combinations that are weighed beside a force that goes with place, however far behind.
-_STATIC = 8
+# Of each size, combinations that are weighed beside a force that goes with place, however far behind; and how many more
+# where it explains a lot.
+_STATIC, _LATER = 8, 64
 # Places at which an effect is tried beside others than the best of the size below.
 _FEW = 60
 _ONE_MORE = {1: "one effect", 2: "a second effect", 3: "a third effect"}
@@ -365,7 +366,22 @@ class Search:
             top = self.found.odds(ranked[0])
             near = [c for c in ranked if self.found.odds(c) > top - _REACH][:_AGAIN]
             few = [c for size in range(1, MOST) for c in [c for c in ranked if self._size(c) == size][:_STATIC]]
-            self.weigher.weigh_static([c for c in dict.fromkeys([*near, self.base, *few]) if c])
+            first = [c for c in dict.fromkeys([*near, self.base, *few]) if c]
+            self.weigher.weigh_static(first)
+            if later := self._gaining(first, [c for c in ranked if c and c not in first])[:_LATER]:
+                self.weigher.weigh_static(later)
+
+    def _gaining(self, first: Sequence[Combination], others: Sequence[Combination]) -> list[Combination]:
+        """Those that would come near the best if a force that goes with place gave them as much as any of the first."""
+        gains = [self._odds(c, "static") - self._odds(c, "white") for c in first if self.found.of(c, "static")]
+        top, most = max(map(self.found.odds, first)), max(gains, default=0.0)
+        return [c for c in others if most > _WORTH and self._odds(c, "white") + most > top - _WORTH]
+
+    def _odds(self, combination: Combination, kind: str) -> float:
+        """The same as `Found.odds` under one kind of remainder, which was weighed."""
+        one = self.found.of(combination, kind)
+        assert one is not None
+        return one.log_evidence + self.found.prices.log(combination)
 
     def _weigh_forces(self) -> None:
         """Best combinations again, each with a missing force beside it; only the very best where that needs none."""
