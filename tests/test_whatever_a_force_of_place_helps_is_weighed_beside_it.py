@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from symplearn.diagnosis._found import Found
-from symplearn.diagnosis._search import Search
+from symplearn.diagnosis._remainders import Remainders
 from symplearn.diagnosis._start import priors_without_effects
+from symplearn.diagnosis._trajectory import Stepper
 from symplearn.diagnosis._weighed import Estimate
+from symplearn.diagnosis._weigher import Weigher
 
 TIMES = np.linspace(0.0, 10.0, 50)
 # Log evidences of pairs under white noise: many like the best, some a little behind, some far behind.
@@ -19,7 +21,7 @@ BEST, BEHIND, FAR = [100.0] * 30, [99.0] * 5, [90.0] * 5
 
 
 @pytest.mark.parametrize(("gain", "expected"), [(30.0, 35), (-1.0, 24)], ids=["a remainder", "none"])
-def test_it_is_tried_beside_all_that_it_may_lift(gain, expected):
+def test_it_is_tried_beside_all_that_it_may_lift(monkeypatch, gain, expected):
     """What is one nat behind the best would be one behind them with it, and is tried; what is ten behind is not. Where
     it explains nothing, the two dozen best are enough."""
     p = cases.problem(cases.simulation("p**2/2 + q**2/2"), [cases.recorded(TIMES, np.cos(TIMES))], 0.05)
@@ -37,8 +39,7 @@ def test_it_is_tried_beside_all_that_it_may_lift(gain, expected):
 
     for pair, evidence in zip(pairs, BEST + BEHIND + FAR, strict=True):
         estimate(pair, "white", evidence)
-    search = object.__new__(Search)
-    search.weigher = SimpleNamespace(found=found, problem=p, base=(), weigh_static=weigh_static)
-    search.deadline, search.progress = np.inf, lambda said: None
-    search._weigh_static()
+    weigher = Weigher(Stepper(p, 1), found)
+    monkeypatch.setattr(weigher, "weigh_static", weigh_static)
+    Remainders(weigher, lambda said: None).weigh_static()
     assert tried == pairs[:expected]

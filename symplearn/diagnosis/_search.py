@@ -16,6 +16,7 @@ from ._null_paths import beside, null_paths
 from ._problem import MOST, Combination, Problem
 from ._prospects import MANY, Prospects, promising
 from ._refinement import Refinement
+from ._remainders import Remainders
 from ._score import Start
 from ._spells import Spells
 from ._start import priors_without_effects, with_states
@@ -35,13 +36,8 @@ _SMALL, _ALIKE = 24, 4
 _FORCED = 6
 # Combinations that are fitted between two looks at the clock.
 _BATCH = 32
-# Of each size, combinations whose clock may wander, however far behind.
-_SIMPLE = 2
-# Combinations that are weighed again in finer steps, or beside a force that goes with place.
+# Combinations that are weighed again in finer steps.
 _AGAIN = 24
-# Of each size, combinations that are weighed beside a force that goes with place, however far behind; and how many more
-# where it explains a lot.
-_STATIC, _LATER = 8, 64
 # Places at which an effect is tried beside others than the best of the size below.
 _FEW = 60
 _ONE_MORE = {1: "one effect", 2: "a second effect", 3: "a third effect"}
@@ -63,6 +59,7 @@ class Search:
         )  # columns that no reading is taken out of
         self.prospects = Prospects(self.weigher)
         self.refinement = Refinement(self.prospects, progress)
+        self.remainders = Remainders(self.weigher, progress)
 
     @property
     def found(self) -> Found:
@@ -98,8 +95,7 @@ class Search:
             if size > 1 and not self._gained(size):
                 break
         self._refine()
-        self._weigh_clocks()
-        self._weigh_static()
+        self._weigh_remainders()
         if self._in_time():
             self.refinement.weigh_beside_the_remainder()
         self.progress("weighing missing forces beside the best combinations")
@@ -183,8 +179,7 @@ class Search:
         if self._in_time():
             self.refinement.move_places()
         w.add_paths(fit_paths(w.stepper, self.null_paths, w.found.priors, self.rows, 3))
-        self._weigh_clocks()
-        self._weigh_static()
+        self._weigh_remainders()
         self._weigh_forces()
         self._weigh_spells()
         self._weigh_with_outliers_in()
@@ -346,42 +341,11 @@ class Search:
         mine = [self.found.best(c) for c in self.found.estimates if self._size(c) == size]
         return max(mine, default=-np.inf) > smaller + _WORTH
 
-    def _weigh_clocks(self) -> None:
-        """The best combinations again where the clock may wander; none where the very best leaves no remainder."""
-        ranked = sorted(self.found.estimates, key=self.found.odds, reverse=True)
-        top, white = self.found.best(ranked[0]), self.found.of(ranked[0], "white")
-        if white is None or white.log_evidence < top:
-            self.progress("weighing errors of the clock")
-            near = [c for c in ranked if self.found.best(c) > top - _REACH][:KEPT]
-            # What a clock excuses may be all that a larger one has ahead of the best of its size.
-            few = [c for size in range(1, MOST) for c in [c for c in ranked if self._size(c) == size][:_SIMPLE]]
-            self.weigher.weigh_clocks(list(dict.fromkeys([*near, self.base, *few])))
-
-    def _weigh_static(self) -> None:
-        """The best combinations again beside a force that goes with place, which any of their forces may stand for; not
-        nothing: alone such a force is no remainder."""
-        ranked = sorted(self.found.estimates, key=self.found.odds, reverse=True)
-        if ranked[0] != self.base and self._in_time():
-            self.progress("weighing small forces that go with place")
-            top = self.found.odds(ranked[0])
-            near = [c for c in ranked if self.found.odds(c) > top - _REACH][:_AGAIN]
-            few = [c for size in range(1, MOST) for c in [c for c in ranked if self._size(c) == size][:_STATIC]]
-            first = [c for c in dict.fromkeys([*near, self.base, *few]) if c]
-            self.weigher.weigh_static(first)
-            if later := self._gaining(first, [c for c in ranked if c and c not in first])[:_LATER]:
-                self.weigher.weigh_static(later)
-
-    def _gaining(self, first: Sequence[Combination], others: Sequence[Combination]) -> list[Combination]:
-        """Those that would come near the best if a force that goes with place gave them as much as any of the first."""
-        gains = [self._odds(c, "static") - self._odds(c, "white") for c in first if self.found.of(c, "static")]
-        top, most = max(map(self.found.odds, first)), max(gains, default=0.0)
-        return [c for c in others if most > _WORTH and self._odds(c, "white") + most > top - _WORTH]
-
-    def _odds(self, combination: Combination, kind: str) -> float:
-        """The same as `Found.odds` under one kind of remainder, which was weighed."""
-        one = self.found.of(combination, kind)
-        assert one is not None
-        return one.log_evidence + self.found.prices.log(combination)
+    def _weigh_remainders(self) -> None:
+        """Errors of the clock, and forces that go with place, beside the best combinations."""
+        self.remainders.weigh_clocks()
+        if self.found.odds(self.base) < max(map(self.found.odds, self.found.estimates)) and self._in_time():
+            self.remainders.weigh_static()
 
     def _weigh_forces(self) -> None:
         """Best combinations again, each with a missing force beside it; only the very best where that needs none."""
