@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from ._found import Found
 from ._problem import MOST, Combination
 from ._weigher import KEPT, Weigher
@@ -49,15 +51,14 @@ class Remainders:
 
     def _lifted(self, first: Sequence[Combination], others: Sequence[Combination]) -> list[Combination]:
         """Those that would come near the best if a force that goes with place gave them as much as any of the first."""
-        gains = [self._odds(c, "static") - self._odds(c, "white") for c in first if self.found.of(c, "static")]
-        top, most = max(map(self.found.odds, first)), max(gains, default=0.0)
+        gains = [self._odds(c, "static") - self._odds(c, "white") for c in first]
+        top, most = max(map(self.found.odds, first)), max((g for g in gains if np.isfinite(g)), default=0.0)
         return [c for c in others if most > _WORTH and self._odds(c, "white") + most > top - _WORTH]
 
     def _odds(self, combination: Combination, kind: str) -> float:
-        """The same as `Found.odds` under one kind of remainder, which was weighed."""
+        """The same as `Found.odds` under one kind of remainder; NaN where it was not weighed."""
         one = self.found.of(combination, kind)
-        assert one is not None
-        return one.log_evidence + self.found.prices.log(combination)
+        return np.nan if one is None else one.log_evidence + self.found.prices.log(combination)
 
     def _ranked(self) -> list[Combination]:
         return sorted(self.found.estimates, key=self.found.odds, reverse=True)
