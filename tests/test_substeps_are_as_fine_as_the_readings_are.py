@@ -2,40 +2,57 @@
 
 import numpy as np
 import pytest
-from engine_cases import recorded, simulation, solved
+from engine_cases import problem, recorded, simulation, solved
 
-from symplearn.diagnosis._build import Restriction, augmented_equations, build, first_substep, refined
+from symplearn.diagnosis._build import first_substep, refined
 from symplearn.diagnosis._calibrate import weights
 from symplearn.diagnosis._course import courses
 from symplearn.diagnosis._stochastic import free_run
 
 _START = (1.2, 0.0)
-_DAMPING = 0.5
 # Of a chi-square below 0.1 between two halvings, a third more in size is left (and a tenth more by higher orders).
 _LEFT = 0.1 * (4 / 3) ** 2 * 1.1
 
 
-def _chi_square(problem, z, noise, truth) -> float:
-    shown = free_run(problem, courses(problem)[0], z, (), 0, z[: problem.state], 0)[0]
-    return float((weights(problem, [len(shown)])[0] * ((shown - truth) / noise) ** 2).sum())
+def _before_and_after(hamiltonian, force, times, readings, noise):
+    """The problem in its first substeps and in those that are fine enough, both with the motion from `_START`."""
+    file = simulation(hamiltonian, more=f'[forces]\np = "{force}"')
+    recordings = [recorded(times, readings, columns=("y",))]
+    substep = first_substep(file, recordings)
+    first = problem(file, recordings, substep)
+    z = np.zeros(first.size)
+    z[0], z[first.state // 2] = _START
+    fine, _ = refined(lambda longest: problem(file, recordings, longest), first, z, np.array([noise]), substep)
+    return first, fine, z
+
+
+def _chi_square(laid_out, z, truth, noise) -> float:
+    shown = free_run(laid_out, courses(laid_out)[0], z, (), 0, z[: laid_out.state], 0)[0]
+    return float((weights(laid_out, [len(shown)])[0] * ((shown - truth) / noise) ** 2).sum())
 
 
 @pytest.mark.parametrize("rows_a_period", [6, 25, 100])
 def test_a_damped_pendulum_is_stepped_as_exactly_as_it_is_read(rows_a_period):
     """However close a damped pendulum's rows lie, stepped readings differ from DOP853's by nothing that can be seen."""
     times = np.arange(0.0, 40.0, 2 * np.pi / rows_a_period)
-    truth = solved(lambda t, s: [s[1], -np.sin(s[0]) - _DAMPING * s[1]], _START, times)[:, :1]
-    noise = np.array([1e-4])
-    file = simulation("p**2/2 - cos(q)", more=f'[forces]\np = "-{_DAMPING}*p"')
-    readings = [recorded(times, truth, columns=("y",))]
-    equations, substep = augmented_equations(file), first_substep(file, readings)
+    truth = solved(lambda t, s: [s[1], -np.sin(s[0]) - 0.5 * s[1]], _START, times)[:, :1]
+    first, fine, z = _before_and_after("p**2/2 - cos(q)", "-0.5*p", times, truth, 1e-4)
+    assert _chi_square(fine, z, truth, 1e-4) < _LEFT
+    assert _chi_square(first, z, truth, 1e-4) > 10 * _LEFT  # what is to be seen without a halving
 
-    def rebuild(longest):
-        return build(file, equations, readings, 0.0, longest, Restriction())
 
-    first = rebuild(substep)
-    z = np.zeros(first.size)
-    z[0], z[first.state // 2] = _START
-    fine, _ = refined(rebuild, first, z, noise, substep)
-    assert _chi_square(fine, z, noise, truth) < _LEFT
-    assert _chi_square(first, z, noise, truth) > 10 * _LEFT  # what is to be seen without a halving
+def test_substeps_in_which_a_known_damping_diverges_are_halved():
+    """An overdamped coil that its first substeps throw out to infinity is stepped as exactly as it is read, too."""
+    times = np.arange(0.0, 100.0, 0.25)
+    truth = solved(lambda t, s: [s[1], -30 * s[1] - 40 * s[0] + 40 * np.sin(0.7 * t)], _START, times)[:, :1]
+    first, fine, z = _before_and_after("p**2/2 + 20*q**2", "-30*p + 40*sin(0.7*t)", times, truth, 0.05)
+    assert _chi_square(fine, z, truth, 0.05) < _LEFT
+    with np.errstate(invalid="ignore", over="ignore"):
+        assert not np.isfinite(_chi_square(first, z, truth, 0.05))
+
+
+def test_a_motion_that_leaves_every_bound_is_halved_in_vain_and_left_alone():
+    """x'' = x**3 leaves for infinity within two units of time, whatever the substeps: they stay as they were."""
+    times = np.arange(0.0, 10.0, 0.1)
+    first, fine, _ = _before_and_after("p**2/2", "q**3", times, np.cos(times)[:, None], 1e-4)
+    assert fine is first

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import sympy
@@ -29,7 +30,7 @@ SUBSTEPS = 8
 # Substeps are fine enough when halving them changes all readings together by less than this chi-square. What is left is
 # a third more in size and shifts no coefficient by more than 0.42 of its error; each halving is worth a factor of 16.
 _CHANGE = 0.1
-_HALVINGS = 5
+_HALVINGS = 6  # the first of them may only keep a stiff motion from being thrown out
 
 
 @dataclass(frozen=True)
@@ -245,21 +246,28 @@ def refined(
     substep: float,
     combination: Combination = (),
 ) -> tuple[Problem, float]:
-    """Halve the substep until a trajectory changes by far less than its readings can tell, at most five times.
+    """Halve the substep until a trajectory changes by far less than its readings can tell, at most six times.
 
-    `rebuild` lays the problem out again with another longest substep, which is returned with it.
+    `rebuild` lays the problem out again with another longest substep, which is returned with it. What diverges in
+    substeps of every length is left as it is.
     """
+    given = problem, substep
     # Half of a substep that is longer than two spans cuts none of them, and would change nothing.
     substep = min(substep, _usual_span(problem))
     coarse, weight = _trajectories(problem, z, combination), weights(problem, rows_fitted(problem.rows))
     for _ in range(_HALVINGS):
         finer = rebuild(substep / 2)
         fine = _trajectories(finer, z, combination)
-        change = sum(float((w * ((a - b) / noise) ** 2).sum()) for w, a, b in zip(weight, coarse, fine, strict=True))
-        if not np.isfinite(change) or change < _CHANGE:
+        if _chi_square(weight, coarse, fine, noise) < _CHANGE:
             break
         problem, coarse, substep = finer, fine, substep / 2
-    return problem, substep
+    return (problem, substep) if all(np.isfinite(one).all() for one in coarse) else given
+
+
+def _chi_square(weight: Sequence[Any], a: Sequence[Any], b: Sequence[Any], noise: Any) -> float:
+    """Of the difference of two runs in all recordings; not finite where one of them, too coarsely stepped, is not."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return sum(float((w * ((x - y) / noise) ** 2).sum()) for w, x, y in zip(weight, a, b, strict=True))
 
 
 def _usual_span(problem: Problem) -> float:
