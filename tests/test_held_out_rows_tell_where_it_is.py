@@ -53,7 +53,7 @@ def learnt():
     stepper, estimate, y = spring()
     p = stepper.problem
     where = [0, p.state // 2, p.state]
-    found = taught(stepper, estimate, root_of(p, estimate, 1.0))
+    found = taught(stepper, estimate, root_of(stepper, estimate, 1.0))
     return stepper, estimate, found, where, *closed_form(y)
 
 
@@ -139,7 +139,7 @@ def test_an_outlier_among_them_moves_little():
     ends = []
     for outlier in (0.0, 20 * NOISE):
         stepper, estimate, _ = spring(outlier)
-        ends.append(taught(stepper, estimate, root_of(stepper.problem, estimate, 1.0)))
+        ends.append(taught(stepper, estimate, root_of(stepper, estimate, 1.0)))
     sd = np.sqrt(np.maximum(np.diag(ends[0].root @ ends[0].root.T), 1e-300))
     assert np.all(np.abs(ends[1].mean - ends[0].mean) < 0.5 * sd + 1e-12)
 

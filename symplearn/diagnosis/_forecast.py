@@ -17,8 +17,10 @@ from .._rows import spans_between
 from .._triangular import semidefinite_cholesky
 from ._bend import bent
 from ._course import effect_coefficients, model_at
-from ._outlook import colour_ratio, intensity_of, start_spread, total_noise
+from ._lasting import colour_ratio, total_noise
+from ._outlook import intensity_of
 from ._problem import Problem
+from ._reach import covariance_within_reach
 from ._record import Forecast
 from ._stochastic import exposure, filter_lane, padded, row_roots, run_lane, softness
 from ._taught import root_of, taught
@@ -74,7 +76,7 @@ def _expected(
     frequency leave it farther than the readings would let them; for the same reason the draws are weighed there.
     """
     unit_key, state_key, push_key = jax.random.split(key, 3)
-    root = root_of(stepper.problem, e, inflation)
+    root = root_of(stepper, e, inflation)
     units = np.asarray(jax.random.normal(unit_key, (_DRAWS // 2, len(root))))
     units = np.concatenate([0 * units[:1], units, -units])
     if e.intensity is None:
@@ -110,9 +112,9 @@ def _by_all_rows(
 def _filtered(stepper: Stepper, e: Estimate, zs: Array, key: Array) -> Array:
     """Draws of the phase point at the last row under a missing force, each filtered through all rows."""
     problem, course = stepper.problem, stepper.courses[0]
-    length = course.times.shape[0]
+    length, state = course.times.shape[0], problem.state
     fixed = (total_noise(e), intensity_of(stepper, e), exposure(e.exposures, 0, length),
-             softness(problem, course, e.z, 0), start_spread(stepper, e, 0),
+             softness(problem, course, e.z, 0), covariance_within_reach(stepper, e, 0)[:state, :state],
              padded(problem.rows[0].readings, length, np.nan), row_roots(problem, 0, length, colour_ratio(e)),
              problem.onehot(e.combination, 0))  # fmt: skip
     keys = jax.random.split(key, len(zs))

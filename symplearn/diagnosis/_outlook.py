@@ -14,34 +14,17 @@ from .._smoother import Smoothed
 from .._triangular import semidefinite_cholesky
 from ._along import What, along, readings
 from ._bend import bent
+from ._lasting import colour_ratio, total_noise
 from ._problem import Problem
+from ._reach import covariance_within_reach
 from ._stochastic import free_run, row_roots, run_filter, run_smoother
 from ._trajectory import Stepper
 from ._weighed import Estimate
 
 
-def colour_ratio(estimate: Estimate) -> Float[np.ndarray, " channel"]:
-    """Variance of the reading error that lasts, by memory or by place, over the white one; zero where there is none."""
-    unknown = [(bend.spread / noise) ** 2 for bend, noise in zip(estimate.bends, estimate.noise, strict=False)]
-    kinds = [[c.ratio for c in estimate.colours], [c.ratio for c in estimate.clocks], unknown or estimate.bent]
-    return sum((np.array(each) for each in kinds if each), np.zeros(len(estimate.noise)))
-
-
-def total_noise(estimate: Estimate) -> Float[np.ndarray, " channel"]:
-    """White reading noise and errors that last together, so that a filter without these does not trust too much."""
-    return estimate.scatter * np.sqrt(1.0 + colour_ratio(estimate))
-
-
 def intensity_of(stepper: Stepper, estimate: Estimate) -> Float[np.ndarray, " d"]:
     """Intensity of the missing force, zero where the remainder is not one."""
     return np.zeros(stepper.problem.equations.dim) if estimate.intensity is None else estimate.intensity
-
-
-def start_spread(stepper: Stepper, estimate: Estimate, recording: int) -> Float[np.ndarray, "state state"]:
-    """Posterior covariance of the phase point at the first row."""
-    state = stepper.problem.state
-    part = slice(recording * state, (recording + 1) * state)
-    return estimate.covariance[part, part]
 
 
 def one_off(problem: Problem, e: Estimate, recording: int, inflation: float) -> list[Float[np.ndarray, " z"]]:
@@ -80,7 +63,7 @@ class Outlook:
         e, r = self.estimate, self.recording
         return run_filter(
             self.stepper.problem, self.stepper.courses[r], r, e.z, e.combination, total_noise(e), colour_ratio(e),
-            self.intensity, start_spread(self.stepper, e, r), self._straight[: self.rows.fitted],
+            self.intensity, self._start_spread, self._straight[: self.rows.fitted],
             self.exposures,
         )  # fmt: skip
 
@@ -91,6 +74,12 @@ class Outlook:
             return self.rows.readings
         expected = self._run(self._begin, 0)[0]
         return self.rows.readings - np.nan_to_num(bent(expected, self.estimate.bends) - expected)
+
+    @cached_property
+    def _start_spread(self) -> Float[np.ndarray, "state state"]:
+        """Posterior covariance of the phase point at the first row, as far as the Gaussian holds."""
+        state = self.stepper.problem.state
+        return covariance_within_reach(self.stepper, self.estimate, self.recording)[:state, :state]
 
     @property
     def _begin(self) -> Float[np.ndarray, " state"]:

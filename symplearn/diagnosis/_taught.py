@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 
 from .._triangular import semidefinite_cholesky
 from ._bend import bent
-from ._outlook import colour_ratio, total_noise
-from ._problem import Problem
+from ._lasting import colour_ratio, total_noise
+from ._reach import covariance_within_reach
 from ._stochastic import row_roots
 from ._trajectory import Stepper
 from ._weighed import Estimate
@@ -29,10 +29,9 @@ _STEPS = 8
 _SETTLED = 1e-3
 
 
-def root_of(problem: Problem, e: Estimate, inflation: float) -> Float[np.ndarray, "local local"]:
-    """Root of the posterior covariance of everything that the first recording depends on."""
-    local = problem.local(0)
-    return np.asarray(semidefinite_cholesky(jnp.asarray(e.covariance[np.ix_(local, local)] * inflation)))
+def root_of(stepper: Stepper, e: Estimate, inflation: float) -> Float[np.ndarray, "local local"]:
+    """Root of the posterior covariance of all that the first recording depends on, as far as it is Gaussian."""
+    return np.asarray(semidefinite_cholesky(jnp.asarray(covariance_within_reach(stepper, e, 0, inflation))))
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,6 +58,8 @@ def warnings(
         out.append("the simulated trajectory diverges: it leaves every bound before the recording ends")
     if not all(o.ok for o in (*without, *with_)):
         out.append("a filter step failed: the trajectory diverges from the recording, or is not finite")
+    for outlook in with_:
+        out += strayed(outlook, recordings[outlook.recording], len(recordings) > 1)
     if forecast is not None:
         out += far_off(forecast, recordings[0])
     if not found.complete:
@@ -88,6 +90,24 @@ def _when(problem: Problem, recordings: Sequence[Recording], best: Estimate) -> 
     return "".join(f", t = {w[0]:g} to {w[1]:g}{run}" for (_, w), run in zip(acts, where, strict=True))
 
 
+def strayed(outlook: Outlook, recording: Recording, is_one_of_several: bool) -> list[str]:
+    """Which readings of the held-out run leave what was read by far."""
+    where = f" in recording {recording.number}" if is_one_of_several else ""
+    return [
+        f"the held-out run of {name}{where} leaves all that was read by more than {_FAR:g} times its range: "
+        "what is fitted does not say how it goes on"
+        for name, run, read in zip(recording.columns, outlook.run.T, recording.readings.T, strict=True)
+        if _off(run, read[~np.isnan(read)]).any()
+    ]
+
+
+def _off(run: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Where readings leave the middle of what was seen by far; what never moved gives no range to compare with."""
+    if not len(seen) or np.ptp(seen) == 0:
+        return np.zeros(len(run), bool)
+    return np.abs(run - (seen.min() + seen.max()) / 2) > _FAR * np.ptp(seen)
+
+
 def far_off(forecast: Forecast, recording: Recording) -> list[str]:
     """Which expected readings leave what was read by far, or are not known, from what time on."""
     out = []
@@ -96,12 +116,8 @@ def far_off(forecast: Forecast, recording: Recording) -> list[str]:
             if (lost := ~np.isfinite(column[label] + column[f"{label}_sd"])).any():
                 out.append(f"the forecast of {name} {label} the findings is empty from t = "
                            f"{forecast.times[lost][0]:g} on: the trajectory diverges there")  # fmt: skip
-        seen = read[~np.isnan(read)]
-        if not len(seen) or np.ptp(seen) == 0:  # what never moved gives no range to compare with
-            continue
         for label in ("before", "after"):
-            off = np.abs(column[label] - (seen.min() + seen.max()) / 2) > _FAR * np.ptp(seen)
-            if off.any():
+            if (off := _off(column[label], read[~np.isnan(read)])).any():
                 out.append(f"the forecast of {name} {label} the findings leaves all that was read by more than "
                            f"{_FAR:g} times its range from t = {forecast.times[off][0]:g} on")  # fmt: skip
     return out
