@@ -1,6 +1,6 @@
 """The augmented simulation in motion: its flow between rows, and what its sensors show."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,8 +14,10 @@ from ._augmented import Equations
 from ._augmented_system import EVERYTHING, Moment, Simulated, SimulatedHamiltonian, Switches
 from ._effects import BIAS, COULOMB, DELAY, DRIFT, GAIN, IMPULSE
 
-# Classical Runge-Kutta, by which a delayed reading goes back in time: where a stage stands, and its weight.
+# Classical Runge-Kutta: where a stage stands, and its weight.
 _STAGES = np.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]])
+# What acts in a part of a substep: the Hamiltonian, a kick that belongs to no stage of it, or one that does.
+_FLOW, _KICK, _DRAG = range(3)
 
 
 class Span(eqx.Module):
@@ -34,12 +36,24 @@ class Span(eqx.Module):
         return self.step * self.pieces
 
 
+class _Part(NamedTuple):
+    """A part of a substep: what acts, for which share of it, at which moment, and where the time lies that a sign of
+    the velocity is averaged over."""
+
+    what: int
+    share: float
+    place: float
+    ahead: float = 0.0
+
+
 class SimulatedFlow(eqx.Module):
     """The flow of the augmented simulation over one `Span`: Hamiltonian part symplectic, dissipation by splitting.
 
-    Strang splitting with kicks of positive length outside (order 2 in the small dissipative forces), Suzuki's
-    composition of the integrator, of order 4, in everything conservative. The doubled state of Tao's method is
-    projected by the mean of its copies at every substep. Time stands still at the middle of every stage and kick.
+    Suzuki's composition of the integrator, of order 4, in everything conservative, and Strang splitting with kicks of
+    positive length outside: order 2 in dissipative forces, which are small. Where forces that a velocity enters are
+    known, and may be large, the smooth ones are composed with all else, to order 4; dry friction stays outside. The
+    doubled state of Tao's method is projected by the mean of its copies at every substep. Time stands still at the
+    middle of every stage and kick.
     """
 
     system: Simulated
@@ -59,48 +73,72 @@ class SimulatedFlow(eqx.Module):
         return jax.lax.fori_loop(0, span.pieces, substep, x)
 
     def _substep(self, x: Array, t: Array, dt: Array, inputs: Array) -> Array:
-        weights = ig.suzuki4(self.integrator).weights
-        middles = np.cumsum(weights) - 0.5 * np.asarray(weights)
-        moments = self.system.moments([t + s * dt for s in (0.25, *middles, 0.75)], dt)
+        parts = self._parts()
+        moments = self.system.moments([t + part.place * dt for part in parts], dt)
         x = self._struck(x, t, dt, inputs)
 
         # Kicks and stages are one loop, so that either is compiled once: unrolled they take minutes to compile.
-        def part(carry: tuple[Array, Array], data: tuple[Moment, Array, Array]) -> tuple[tuple[Array, Array], None]:
-            moment, share, ahead = data
+        def part(carry: tuple[Array, Array], data: tuple[Moment, Array, Array, Array]) -> tuple[Any, None]:
+            moment, share, ahead, what = data
             system = self.system.frozen(moment, inputs)
+            return self._part(system, carry, share * dt, ahead, what), None
 
-            def kicked(carry: tuple[Array, Array]) -> tuple[Array, Array]:
-                q, p = ig.split(self.integrator.project(carry[0]))
-                p, held = self.kick(system, q, p, share * dt, ahead)
-                return self.integrator.lift(jnp.concatenate([q, p])), carry[1] & held
-
-            def carried(carry: tuple[Array, Array]) -> tuple[Array, Array]:
-                return self.integrator.flow(system, carry[0], moment.time, share * dt), carry[1]
-
-            return jax.lax.cond(ahead != 0, kicked, carried, carry), None
-
-        shares = jnp.asarray([0.5, *weights, 0.5], x.dtype)
-        aheads = jnp.asarray([1.0, *[0.0] * len(weights), -1.0], x.dtype)
+        shares = jnp.asarray([part.share for part in parts], x.dtype)
+        aheads = jnp.asarray([part.ahead for part in parts], x.dtype)
+        whats = jnp.asarray([part.what for part in parts])
         begin = self.integrator.lift(x), jnp.ones(len(x) // 2, bool)
-        (state, held), _ = jax.lax.scan(part, begin, (moments, shares, aheads))
+        (state, held), _ = jax.lax.scan(part, begin, (moments, shares, aheads, whats))
         q, p = ig.split(self.integrator.project(state))
         # Held at both ends: without this a body at rest would creep through the flow in between.
         return jnp.concatenate([jnp.where(held, ig.split(x)[0], q), p])
 
+    def _parts(self) -> list["_Part"]:
+        """What a substep is made of, in its order."""
+        weights = np.asarray(ig.suzuki4(self.integrator).weights)
+        ends = np.concatenate([[0.0], np.cumsum(weights)])
+        inside = [_Part(_FLOW, w, begin + 0.5 * w) for w, begin in zip(weights, ends[:-1], strict=True)]
+        if self.system.equations.kick is not None:
+            halves = np.concatenate([[0.0], weights, [0.0]]) / 2
+            drags = [_Part(_DRAG, w, end) for w, end in zip(halves[:-1] + halves[1:], ends, strict=True)]
+            inside = [one for pair in zip(drags[:-1], inside, strict=True) for one in pair] + drags[-1:]
+        return [_Part(_KICK, 0.5, 0.25, 1.0), *inside, _Part(_KICK, 0.5, 0.75, -1.0)]
+
+    def _part(
+        self, system: SimulatedHamiltonian, carry: tuple[Array, Array], dt: Array, ahead: Array, what: Array
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """The state after one part of a substep, and what friction has held so far."""
+
+        def carried(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+            return self.integrator.flow(system, carry[0], system.moment.time, dt), carry[1]
+
+        def kicked(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+            q, p = ig.split(self.integrator.project(carry[0]))
+            p, held = self.kick(system, q, p, dt, ahead, carry[1] & (ahead < 0))
+            return self.integrator.lift(jnp.concatenate([q, p])), carry[1] & held
+
+        def dragged(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+            copies = [ig.split(x) for x in carry[0].reshape(self.integrator.copies, -1)]
+            return jnp.concatenate([x for q, p in copies for x in (q, _dragged(system, q, p, dt))]), carry[1]
+
+        if system.equations.kick is None:
+            return jax.lax.cond(what == _KICK, kicked, carried, carry)
+        return jax.lax.switch(what, [carried, kicked, dragged], carry)
+
     def kick(
         self, system: SimulatedHamiltonian, q: Float[Array, " width"], p: Float[Array, " width"],
-        dt: Float[Array, ""], ahead: Float[Array, ""] | float = 1.0,
+        dt: Float[Array, ""], ahead: Float[Array, ""] | float = 1.0, stuck: Bool[Array, " width"] | bool = False,
     ) -> tuple[Float[Array, " width"], Bool[Array, " width"]]:  # fmt: skip
-        """The momentum after the forces that depend on velocity have acted for `dt` at frozen q, and what stuck.
+        """The momentum after the forces that depend on velocity have acted for `dt` at frozen q, and what sticks.
 
-        Smooth drag by the explicit midpoint rule.
+        Smooth drag by the explicit midpoint rule, where it is not composed with all else. What is `stuck` has not moved
+        since a kick as long as this one.
         """
-        wide = lambda force: jnp.pad(force, (0, system.equations.width - system.equations.dim))  # noqa: E731
-        half = p + 0.5 * dt * wide(system.smooth_force(q, p))
-        p = p + dt * wide(system.smooth_force(q, half))
+        if system.equations.kick is None:
+            half = p + 0.5 * dt * _drag(system, q, p)
+            p = p + dt * _drag(system, q, half)
         free = jnp.zeros(p.shape, bool)
         return jax.lax.cond(
-            self.system.switches.friction, lambda p: _rubbed(system, q, p, dt, ahead), lambda p: (p, free), p
+            self.system.switches.friction, lambda p: _rubbed(system, q, p, dt, ahead, stuck), lambda p: (p, free), p
         )
 
     def _struck(self, x: Array, t: Array, dt: Array, inputs: Array) -> Array:
@@ -136,12 +174,31 @@ class SimulatedFlow(eqx.Module):
         return jnp.where(inside, size, 0.0), jnp.where(inside, share, 0.0), places
 
 
-def _rubbed(system: SimulatedHamiltonian, q: Array, p: Array, dt: Array, ahead: Any) -> tuple[Array, Array]:
+def _drag(system: SimulatedHamiltonian, q: Array, p: Array) -> Float[Array, " width"]:
+    """Smooth forces that a velocity enters, by component of the momentum."""
+    return jnp.pad(system.smooth_force(q, p), (0, system.equations.width - system.equations.dim))
+
+
+def _dragged(system: SimulatedHamiltonian, q: Array, p: Array, dt: Array) -> Float[Array, " width"]:
+    """The momentum after these have acted for `dt` at frozen q, by classical Runge-Kutta; its stages are a loop, so
+    that the force is compiled once."""
+
+    def stage(carry: tuple[Array, Array], row: Array) -> tuple[tuple[Array, Array], None]:
+        total, rate = carry
+        place, weight = row
+        rate = _drag(system, q, p + place * dt * rate)
+        return (total + weight * dt * rate, rate), None
+
+    return jax.lax.scan(stage, (p, jnp.zeros_like(p)), jnp.asarray(_STAGES, p.dtype))[0][0]
+
+
+def _rubbed(system: SimulatedHamiltonian, q: Array, p: Array, dt: Array, ahead: Any, stuck: Any) -> tuple[Array, Array]:
     """The momentum after dry friction has acted for `dt`, and what it has stopped.
 
     By the mean sign of the velocity over the time that the kick stands for, which lies `ahead` (1) or behind (-1): a
     sign taken at one instant would make the trajectory jump with the starting values. Where friction can hold every
-    other force, it stops the motion. Exact for a kinetic energy quadratic in each momentum.
+    other force, it stops the motion; of what was stuck it takes all that the other forces have given since, half of it
+    before this kick's own time. Exact for a kinetic energy quadratic in each momentum.
     """
     eq, n = system.equations, system.equations.declared
     friction = system.of(COULOMB)
@@ -149,7 +206,8 @@ def _rubbed(system: SimulatedHamiltonian, q: Array, p: Array, dt: Array, ahead: 
     v, acceleration = v[:n], acceleration[:n]
     softness = eq.softness(system.arguments(q, p))[:n]
     stop = v / softness
-    held = (friction > 0) & (jnp.abs(stop) <= friction * dt) & (jnp.abs(acceleration) <= friction * softness)
+    most = friction * dt * jnp.where(jnp.broadcast_to(stuck, q.shape)[:n], 2.0, 1.0)
+    held = (friction > 0) & (jnp.abs(stop) <= most) & (jnp.abs(acceleration) <= friction * softness)
     change = jnp.where(held, stop, friction * dt * _mean_sign(v, v + ahead * dt * acceleration))
     return p - jnp.pad(change, (0, eq.width - n)), jnp.pad(held, (0, eq.width - n))
 
