@@ -14,16 +14,21 @@ _START = (1.2, 0.0)
 _LEFT = 0.1 * (4 / 3) ** 2 * 1.1
 
 
-def _before_and_after(hamiltonian, force, times, readings, noise):
-    """The problem in its first substeps and in those that are fine enough, both with the motion from `_START`."""
-    file = simulation(hamiltonian, more=f'[forces]\np = "{force}"')
+def _forced(force):
+    return f'[forces]\np = "{force}"'
+
+
+def _before_and_after(hamiltonian, more, times, readings, noise):
+    """The problem in its first substeps and in those that are fine enough, with the motion from `_START`; and whether
+    they are said to be."""
+    file = simulation(hamiltonian, more=more)
     recordings = [recorded(times, readings, columns=("y",))]
     substep = first_substep(file, recordings)
     first = problem(file, recordings, substep)
     z = np.zeros(first.size)
     z[0], z[first.state // 2] = _START
-    fine, _ = refined(lambda longest: problem(file, recordings, longest), first, z, np.array([noise]), substep)
-    return first, fine, z
+    fine, _, is_fine = refined(lambda longest: problem(file, recordings, longest), first, z, np.array([noise]), substep)
+    return first, fine, z, is_fine
 
 
 def _chi_square(laid_out, z, truth, noise) -> float:
@@ -36,8 +41,10 @@ def test_a_damped_pendulum_is_stepped_as_exactly_as_it_is_read(rows_a_period):
     """However close a damped pendulum's rows lie, stepped readings differ from DOP853's by nothing that can be seen."""
     times = np.arange(0.0, 40.0, 2 * np.pi / rows_a_period)
     truth = solved(lambda t, s: [s[1], -np.sin(s[0]) - 0.5 * s[1]], _START, times)[:, :1]
-    first, fine, z = _before_and_after("p**2/2 - cos(q)", "-0.5*p", times, truth, 1e-4)
-    assert _chi_square(fine, z, truth, 1e-4) < _LEFT
+    # A term of the vocabulary, which is split in to order two.
+    damped = '[[terms]]\neffect = "viscous_damping"\ntarget = "q"\nc = 0.5\n'
+    first, fine, z, is_fine = _before_and_after("p**2/2 - cos(q)", damped, times, truth, 1e-4)
+    assert is_fine and _chi_square(fine, z, truth, 1e-4) < _LEFT
     assert _chi_square(first, z, truth, 1e-4) > 10 * _LEFT  # what is to be seen without a halving
 
 
@@ -45,14 +52,17 @@ def test_substeps_in_which_a_known_damping_diverges_are_halved():
     """An overdamped coil that its first substeps throw out to infinity is stepped as exactly as it is read, too."""
     times = np.arange(0.0, 100.0, 0.25)
     truth = solved(lambda t, s: [s[1], -30 * s[1] - 40 * s[0] + 40 * np.sin(0.7 * t)], _START, times)[:, :1]
-    first, fine, z = _before_and_after("p**2/2 + 20*q**2", "-30*p + 40*sin(0.7*t)", times, truth, 0.05)
-    assert _chi_square(fine, z, truth, 0.05) < _LEFT
+    first, fine, z, is_fine = _before_and_after(
+        "p**2/2 + 20*q**2", _forced("-30*p + 40*sin(0.7*t)"), times, truth, 0.05
+    )
+    assert is_fine and _chi_square(fine, z, truth, 0.05) < _LEFT
     with np.errstate(invalid="ignore", over="ignore"):
         assert not np.isfinite(_chi_square(first, z, truth, 0.05))
 
 
 def test_a_motion_that_leaves_every_bound_is_halved_in_vain_and_left_alone():
-    """x'' = x**3 leaves for infinity within two units of time, whatever the substeps: they stay as they were."""
+    """x'' = x**3 leaves for infinity within two units of time, whatever the substeps: they stay as they were, and
+    are said to be too long."""
     times = np.arange(0.0, 10.0, 0.1)
-    first, fine, _ = _before_and_after("p**2/2", "q**3", times, np.cos(times)[:, None], 1e-4)
-    assert fine is first
+    first, fine, _, is_fine = _before_and_after("p**2/2", _forced("q**3"), times, np.cos(times)[:, None], 1e-4)
+    assert fine is first and not is_fine

@@ -245,23 +245,24 @@ def refined(
     noise: np.ndarray,
     substep: float,
     combination: Combination = (),
-) -> tuple[Problem, float]:
+) -> tuple[Problem, float, bool]:
     """Halve the substep until a trajectory changes by far less than its readings can tell, at most six times.
 
-    `rebuild` lays the problem out again with another longest substep, which is returned with it. What diverges in
-    substeps of every length is left as it is.
+    `rebuild` lays the problem out again with another longest substep, which is returned with it, and whether it is fine
+    enough. What diverges in substeps of every length is left as it is.
     """
-    given = problem, substep
+    given, is_fine = (problem, substep), False
     # Half of a substep that is longer than two spans cuts none of them, and would change nothing.
     substep = min(substep, _usual_span(problem))
     coarse, weight = _trajectories(problem, z, combination), weights(problem, rows_fitted(problem.rows))
     for _ in range(_HALVINGS):
         finer = rebuild(substep / 2)
         fine = _trajectories(finer, z, combination)
-        if _chi_square(weight, coarse, fine, noise) < _CHANGE:
+        if is_fine := _chi_square(weight, coarse, fine, noise) < _CHANGE:
             break
         problem, coarse, substep = finer, fine, substep / 2
-    return (problem, substep) if all(np.isfinite(one).all() for one in coarse) else given
+    left = (problem, substep) if all(np.isfinite(one).all() for one in coarse) else given
+    return *left, is_fine
 
 
 def _chi_square(weight: Sequence[Any], a: Sequence[Any], b: Sequence[Any], noise: Any) -> float:

@@ -46,19 +46,20 @@ def searched(
     seeds = first_fits(stepper, priors_without_effects(problem), rows_fitted(problem.rows))
     # A few rows are fitted too well to tell the noise; where it is still too small, the search only takes longer.
     noise = np.maximum(seeds.noise[0], _ROUGH * rough_noise(problem, rows_fitted(problem.rows)))
-    finer, substep = refined(rebuild, problem, seeds.z[0], noise, substep)
+    finer, substep, is_fine = refined(rebuild, problem, seeds.z[0], noise, substep)
     stepper = stepper if finer is problem else Stepper(finer, options.jobs)
     search = _run(stepper, seeds.z, deadline, options)
     found = search.found
     best = max((e for es in found.estimates.values() for e in es), key=lambda e: e.log_evidence)
     if np.isfinite(best.log_evidence):
-        finer, _ = refined(rebuild, finer, best.z, best.reading_noise, substep, best.combination)
+        finer, _, is_fine = refined(rebuild, finer, best.z, best.reading_noise, substep, best.combination)
         if finer is not stepper.problem:
             options.progress("weighing the best combinations again in finer steps")
             found = search.again(Stepper(finer, options.jobs))
     found, stepper = _with_unnamed(file, recordings, options, search, found)
     options.progress("comparing how well answers predict ahead")
     look_ahead(search.stepper, found, search.rows)
+    found.is_fine = is_fine
     return found, stepper
 
 

@@ -78,6 +78,7 @@ class Found:
     complete: bool = True
     choices: dict[int, float] = field(default_factory=dict)  # log of how many expressions a force was chosen from
     ahead: dict[Combination, Ahead] = field(default_factory=dict)  # of the likeliest, beside a clear remainder
+    is_fine: bool = True  # whether substeps are as short as the readings ask
 
     def add(self, estimate: Estimate) -> None:
         """Keep an estimate beside those of the same combination and kind, as a mode where it stands apart; one whose

@@ -62,6 +62,9 @@ def warnings(
         out += strayed(outlook, recordings[outlook.recording], len(recordings) > 1)
     if forecast is not None:
         out += far_off(forecast, recordings[0])
+    if not found.is_fine:
+        out.append("halving the substeps once more still changes the readings by what can be seen: the motion is too "
+                   "stiff, or too sensitive, for them; try a shorter [integrator] step")  # fmt: skip
     if not found.complete:
         out.append("the time limit was reached before every combination was weighed")
     for j, name in enumerate(c.names):
