@@ -149,6 +149,34 @@ def test_a_start_is_found_in_any_unit(unit):
     assert found.cost[0] < 51  # a chi-squared of 24 readings exceeds it once in a thousand times
 
 
+def test_a_top_is_found_whose_mean_start_is_a_singularity():
+    """Of a spinning top in spherical angles, whose rates are infinite at the prior mean of zero, by DOP853: momenta are
+    sized about a place beside it, far below the angles, and the best lane follows what is read."""
+    a, s, mgl = 0.003, 0.05, 0.09
+
+    def rates(t, x):
+        th, ph, p, turning = x
+        turn = (turning - s * np.cos(th)) / (a * np.sin(th) ** 2)
+        return [p / a, turn, turn * (np.cos(th) * turn * a - s) * np.sin(th) + mgl * np.sin(th), 0.0]
+
+    times = np.arange(200) * 0.02
+    th, ph, *_ = cases.solved(rates, [0.7, 0.4, 0.0005, 0.041], times).T
+    assert np.ptp(th) > 0.02  # it nods
+    read = np.stack([np.sin(th) * np.cos(ph), np.sin(th) * np.sin(ph)], axis=1)
+    read += 0.01 * np.random.default_rng(8).normal(size=read.shape)
+    energy = "pth**2/(2*A) + (pph - S*cos(th))**2/(2*A*sin(th)**2) + mgl*cos(th)"
+    more = f"[parameters]\nA = {a}\nS = {s}\nmgl = {mgl}\n[recording.noise]\nu = 0.01\nv = 0.01"
+    seen = {"u": "sin(th)*cos(ph)", "v": "sin(th)*sin(ph)"}
+    file = cases.simulation(energy, ("th", "ph"), ("pth", "pph"), seen, more)
+    problem = cases.problem(file, [cases.recorded(times, read, columns=("u", "v"))], 0.02)
+    priors, width = priors_without_effects(problem), problem.equations.width
+    size = sizes_of_motion(problem, priors.mean, 0)[[0, 1, width, width + 1]]
+    assert np.isfinite(size).all() and (size[2:] < 0.1).all() and (size[:2] >= 1.0).all()
+    found = first_fits(Stepper(problem), priors, [200])
+    # A chi-squared of the 38 readings of its last window exceeds it once in a thousand times.
+    assert found.cost[0] < 71
+
+
 @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e6])
 def test_a_parameter_counts_in_its_own_size(unit):
     """Of a capacitor in any unit the stiffness falls by 1/C^2 per unit of C, and first fits hold C to a thousandth."""

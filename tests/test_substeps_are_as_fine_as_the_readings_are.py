@@ -66,3 +66,20 @@ def test_a_motion_that_leaves_every_bound_is_halved_in_vain_and_left_alone():
     times = np.arange(0.0, 10.0, 0.1)
     first, fine, _, is_fine = _before_and_after("p**2/2", _forced("q**3"), times, np.cos(times)[:, None], 1e-4)
     assert fine is first and not is_fine
+
+
+def test_a_motion_that_no_halving_settles_is_left_alone():
+    """A top that the start throws through its singularity goes elsewhere in substeps of every length: they stay as they
+    were, for sixty times the work would tell nothing, and are said to be too long."""
+    times = np.arange(0.0, 4.0, 0.02)
+    energy = "pth**2/2 + (pph - cos(th))**2/(2*sin(th)**2) + 3*cos(th)"
+    file = simulation(energy, ("th", "ph"), ("pth", "pph"), {"y": "sin(th)*cos(ph)"})
+    recordings = [recorded(times, np.cos(times)[:, None], columns=("y",))]
+    substep = first_substep(file, recordings)
+    first = problem(file, recordings, substep)
+    z = np.zeros(first.size)
+    z[[0, 1, first.state // 2, first.state // 2 + 1]] = -0.09, -1.9, -150.0, -4.4
+    fine, length, is_fine = refined(
+        lambda longest: problem(file, recordings, longest), first, z, np.array([0.01]), substep
+    )
+    assert fine is first and length == substep and not is_fine

@@ -14,13 +14,13 @@ from .._effects import IMPULSE, REGIME
 from ._calibrate import calibrate, residuals, weights
 from ._found import Ahead, Found
 from ._problem import Combination
-from ._trajectory import LANES, Stepper
+from ._trajectory import Stepper
 
 # Nats by which a remainder stands above white noise, by which an answer may lie behind the best to be looked at, and
 # which a score takes off at most: a fit to the first part may fail for reasons of its own.
 _CLEAR, _REACH, _WORST = 10.0, 100.0, 10.0
 # Combinations that are looked at.
-_MOST = 2 * LANES
+_MOST = 16
 # Shares of the rows that are fitted, steps of each fit, and what one channel's free run counts for.
 _ORIGINS, _STEPS, _READINGS = (0.4, 0.6, 0.8), 20, 2.0
 # Nats by which a combination scores clearly above nothing.

@@ -30,6 +30,7 @@ SUBSTEPS = 8
 # Substeps are fine enough when halving them changes all readings together by less than this chi-square. What is left is
 # a third more in size and shifts no coefficient by more than 0.42 of its error; each halving is worth a factor of 16.
 _CHANGE = 0.1
+_SETTLING = 0.1  # of the first change, what the last halving leaves where halvings help: 1e-3 even about kinks
 _HALVINGS = 6  # the first of them may only keep a stiff motion from being thrown out
 
 
@@ -249,20 +250,23 @@ def refined(
     """Halve the substep until a trajectory changes by far less than its readings can tell, at most six times.
 
     `rebuild` lays the problem out again with another longest substep, which is returned with it, and whether it is fine
-    enough. What diverges in substeps of every length is left as it is.
+    enough. What diverges in substeps of every length, or does not settle, as a motion that is not the recorded one may
+    not near a singularity, is left as it is.
     """
-    given, is_fine = (problem, substep), False
+    given, is_fine, changes = (problem, substep), False, list[float]()
     # Half of a substep that is longer than two spans cuts none of them, and would change nothing.
     substep = min(substep, _usual_span(problem))
     coarse, weight = _trajectories(problem, z, combination), weights(problem, rows_fitted(problem.rows))
     for _ in range(_HALVINGS):
         finer = rebuild(substep / 2)
         fine = _trajectories(finer, z, combination)
-        if is_fine := _chi_square(weight, coarse, fine, noise) < _CHANGE:
+        changes.append(_chi_square(weight, coarse, fine, noise))
+        if is_fine := changes[-1] < _CHANGE:
             break
         problem, coarse, substep = finer, fine, substep / 2
-    left = (problem, substep) if all(np.isfinite(one).all() for one in coarse) else given
-    return *left, is_fine
+    finite = all(np.isfinite(one).all() for one in coarse)
+    settles = is_fine or not changes[-1] > _SETTLING * changes[0]  # what diverged at first may settle yet
+    return (problem, substep, is_fine) if finite and settles else (*given, is_fine)
 
 
 def _chi_square(weight: Sequence[Any], a: Sequence[Any], b: Sequence[Any], noise: Any) -> float:

@@ -21,7 +21,7 @@ from ._score import Start
 from ._spells import Spells
 from ._start import priors_without_effects, with_states
 from ._stochastic import trajectories
-from ._trajectory import LANES, Stepper
+from ._trajectory import Stepper
 from ._unnamed import Proposal
 from ._weigher import KEPT, Weigher
 
@@ -32,6 +32,8 @@ _REACH = 30.0
 _BASES, _PAIRS, _WORTH = 4, 32, 2.0
 # How many effects are fitted where they are small, and how often the same at other places or in other recordings.
 _SMALL, _ALIKE = 24, 4
+# From how many seeds, and how many paths under a missing force, the simulation as it is is fitted.
+_STARTS = 4
 # Combinations that a missing force is tried beside.
 _FORCED = 6
 # Combinations that are fitted between two looks at the clock.
@@ -152,8 +154,8 @@ class Search:
 
     def _weigh_nothing(self) -> None:
         """The simulation as it is, from many starts: a local optimum here would look like physics left out."""
-        half, ways = LANES // 2, [fit.z for fit in self.null_paths if np.isfinite(fit.log_evidence)]
-        starts = [*self.seeds[:half], *ways[-half:]]
+        ways = [fit.z for fit in self.null_paths if np.isfinite(fit.log_evidence)]
+        starts = [*self.seeds[:_STARTS], *ways[-_STARTS:]]
         self.weigher.weigh([Start(self.base, self._bare(z), 0.0) for z in starts])
         best = self.found.of(self.base, "white")
         if best is not None and np.isfinite(best.log_evidence):

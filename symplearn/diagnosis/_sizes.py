@@ -12,6 +12,8 @@ from ._problem import Problem
 
 # Displacements that are tried.
 _TRIED = np.geomspace(1e-15, 1e15, 31)
+# How far beside a mean that tells nothing the same is tried.
+_ASIDE = 1.0
 # A displacement shows that moves a reading by this share of what the readings vary.
 _SHOWN = 0.3
 
@@ -22,8 +24,21 @@ def sizes_of_motion(problem: Problem, z: Float[np.ndarray, " z"], r: int) -> Flo
 
     **Arguments:** - `z`: the unknowns, at their prior means. - `r`: the recording, from 0.
     """
-    own, width, d = slice(r * problem.state, (r + 1) * problem.state), problem.equations.width, problem.equations.dim
-    begin, out = z[own], np.full(problem.state, np.nan)
+    begin = z[r * problem.state : (r + 1) * problem.state]
+    at_mean = _sizes_about(problem, z, r, begin)
+    width, d = problem.equations.width, problem.equations.dim
+    if np.isfinite(at_mean[[*range(d), *range(width, width + d)]]).all():
+        return at_mean
+    # Where nothing is known the mean is zero, which may be a singularity: no angle, no distance.
+    aside = _sizes_about(problem, z, r, np.where(np.isinf(problem.initial.sd), begin + _ASIDE, begin))
+    return np.where(np.isfinite(at_mean), at_mean, aside)
+
+
+def _sizes_about(
+    problem: Problem, z: Float[np.ndarray, " z"], r: int, begin: Float[np.ndarray, " state"]
+) -> Float[np.ndarray, " state"]:
+    """The same by displacements from one phase point."""
+    width, d, out = problem.equations.width, problem.equations.dim, np.full(problem.state, np.nan)
     vary, time = _variation(problem, r)
     shown = np.stack([_shown(_moved(problem, readings, r, z, begin, i), vary) for i in range(problem.state)])
     pace = np.array([_slope(_moved(problem, velocity, r, z, begin, width + i)[:, i]) for i in range(d)])

@@ -106,16 +106,19 @@ def _scattered(problem: Problem, priors: Priors) -> Float[np.ndarray, "lane z"]:
     noise = rng.normal(size=(_DRAWN, problem.head))
     given = np.tile(np.where(np.isfinite(problem.initial.sd), problem.initial.sd, 0.0), len(problem.rows))
     unknown = np.tile(np.isinf(problem.initial.sd), len(problem.rows))
-    size = np.concatenate([_unit_sizes(problem, priors, r) for r in range(len(problem.rows))])
+    own = np.concatenate([sizes_of_motion(problem, priors.mean, r) for r in range(len(problem.rows))])
+    # Every other round of spreads counts in the motion's own sizes, which may differ by far; else in one, where spreads
+    # of all sizes reach it.
+    rounds = np.arange(_DRAWN) // len(_SPREADS) % 2 == 1
+    size = np.where(rounds[:, None] & np.isfinite(own), own, _unit_sizes(own))
     z[:, : problem.head] += np.where(unknown, noise * size * spread[:, None], given * noise)
     return z
 
 
-def _unit_sizes(problem: Problem, priors: Priors, r: int) -> Float[np.ndarray, " state"]:
+@np.errstate(invalid="ignore")
+def _unit_sizes(own: Float[np.ndarray, " head"]) -> Float[np.ndarray, " head"]:
     """What a start is counted in: one, where spreads of all sizes reach it; else the size of the motion."""
-    size = sizes_of_motion(problem, priors.mean, r)
-    with np.errstate(invalid="ignore"):
-        return np.where((size < _SMALL) | (size > _BIG), size, 1.0)
+    return np.where((own < _SMALL) | (own > _BIG), own, 1.0)
 
 
 def without_turns(problem: Problem, z: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:

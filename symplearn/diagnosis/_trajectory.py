@@ -16,7 +16,9 @@ from ._course import costly, courses, effect_coefficients, model_at, switches_of
 from ._problem import Combination, Problem
 
 DIRECTIONS = 8  # slopes are taken along so many directions at a time, so that one program is compiled
-LANES = 8  # combinations stepped together; a fixed number, so that the answer does not depend on the cores
+# Combinations stepped together: a fixed number, so that the answer does not depend on the cores, and a small one, since
+# a lane costs as much among few as among many, and those that are lacking are stepped in vain.
+LANES = 4
 
 A = TypeVar("A")
 B = TypeVar("B")
@@ -93,7 +95,7 @@ class Stepper:
         self, zs: Float[np.ndarray, "lane z"], combinations: Sequence[Combination], rows: Sequence[int]
     ) -> list[Predictions]:
         """Predictions by recording, over its first `rows[r]` rows."""
-        p, alike = self.problem, np.argsort([costly(self.problem, c) for c in combinations], kind="stable")
+        p, alike = self.problem, self._alike(combinations)
         chunks = [alike[a : a + LANES] for a in range(0, len(zs), LANES)]
         work, runs = [], []
         for r in range(len(self.courses)):
@@ -106,6 +108,11 @@ class Stepper:
         parts = [self._spread(*one, *found, rows) for one, found in zip(work, self._stepped(runs), strict=True)]
         back = np.argsort(alike)
         return [_joined(parts[r * len(chunks) : (r + 1) * len(chunks)], back) for r in range(len(self.courses))]
+
+    def _alike(self, combinations: Sequence[Combination]) -> Int[np.ndarray, " lane"]:
+        """Lanes in an order in which those of the same cost come together, by what acts and by how many directions."""
+        calls = [-(-int(self.problem.active(c).sum()) // DIRECTIONS) for c in combinations]
+        return np.lexsort((calls, [costly(self.problem, c) for c in combinations]))
 
     def _spread(
         self, r: int, free: Sequence[np.ndarray], shown: np.ndarray, along: np.ndarray, rows: Sequence[int]
