@@ -115,6 +115,15 @@ def test_equations_have_every_effect_in_its_place():
     )
 
 
+@pytest.mark.parametrize(
+    ("known", "line"), [("-c*p/m + u", "- c*p/m + u"), ("  - k*q", "- k*q"), ("u - c*p", "+ u - c*p")]
+)
+def test_a_known_force_that_begins_with_a_minus_is_taken_away(known, line):
+    """What is added to -dH/dq is one sum with it, whatever sign it begins with."""
+    lines = equation_lines(["q"], ["p"], [], "p**2/2", {"p": known}, {}, [])
+    assert lines[2] == f"dp/dt = -dH/dq {line}"
+
+
 def test_equations_without_effects_are_the_simulation():
     """Nothing chosen, nothing added; and a hidden coordinate takes a name that is free."""
     assert equation_lines(*PARTS, []) == (

@@ -108,9 +108,14 @@ def equation_lines(
         further += _own_lines(one, coefficients, names["z"], dict(zip(coordinates, momenta, strict=True)))
     lines = [f"H = {hamiltonian}"]
     for q, p in zip(coordinates, momenta, strict=True):
-        known = [f"+ {forces[p]}"] if p in forces else []
+        known = [_appended(forces[p].strip())] if p in forces else []
         lines += [f"d{q}/dt = dH/d{p}", " ".join([f"d{p}/dt = -dH/d{q}", *known, *added[q]])]
     return (*lines, *further, *_parameter_lines(chosen), *_reading_lines(columns, readings, chosen))
+
+
+def _appended(terms: str) -> str:
+    """A sum, as it continues another."""
+    return f"- {terms[1:].lstrip()}" if terms.startswith("-") else f"+ {terms}"
 
 
 def _law(one: Candidate, values: Mapping[str, str]) -> str:
