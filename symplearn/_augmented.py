@@ -106,8 +106,7 @@ def equations(
     for one in candidates:
         if one.terms:
             forces[one.place] += sympy.Add(*(c[one.first + k] * term for k, term in enumerate(one.terms)))
-    still = [_at_rest(f, momenta) for f in forces]
-    driven = [f - s for f, s in zip(forces, still, strict=True)]
+    still, driven = zip(*(f.as_independent(*momenta, as_Add=True) for f in forces), strict=True)
     every = [*parameters, *(one.symbol for one in known.further)]
     arguments = [*coordinates, *momenta, *every, *inputs, sympy.Symbol("t", real=True), *c]
 
@@ -133,17 +132,10 @@ def equations(
         slope=compiled([derivative(energy, q) - f for q, f in zip(coordinates, still, strict=True)]),
         velocity=compiled([derivative(known.hamiltonian, p) for p in momenta]),
         softness=compiled([derivative(derivative(known.hamiltonian, p), p) for p in momenta]),
-        kick=compiled(driven) if any(f.free_symbols & set(momenta) for f in driven) else None,
+        kick=compiled(driven) if any(f != 0 for f in driven) else None,
         readings=compiled(list(known.readings.values())),
         impulses=compiled([value for _, size, when in known.impulses for value in (size, when)]),
     )
-
-
-def _at_rest(force: sympy.Expr, momenta: Sequence[sympy.Symbol]) -> sympy.Expr:
-    """The part of a known force that no momentum enters: what it is where all of them are zero, nothing where it has no
-    value there."""
-    still = force.subs({p: 0 for p in momenta})
-    return sympy.Integer(0) if still.has(sympy.zoo, sympy.nan, sympy.oo, -sympy.oo) else still
 
 
 def _potential(one: Candidate, coordinates: Sequence[sympy.Symbol]) -> sympy.Expr:

@@ -245,8 +245,8 @@ def test_dry_friction_lets_go_when_pulled_harder():
 @pytest.mark.parametrize("pieces", [30, 300])
 @pytest.mark.parametrize("share", [0.3, 0.7, 0.95])
 def test_dry_friction_holds_against_any_force_below_its_own(share, pieces):
-    """A body at rest under a share of f does not move by a digit, in substeps of any length; in between known forces of
-    velocity neither, of which one that pulls with a constant (a belt) counts as the force that it is at rest."""
+    """A body at rest under a share of f does not move by a digit, in substeps of any length; a belt, a
+    known force of velocity that pulls at rest, neither."""
     f, place = 0.5, np.arcsinh(share * 0.5 / A)
     on = vector(SOFT, "coulomb_friction", {"f": f})
     np.testing.assert_array_equal(moved(SOFT, LEAPFROG, on, [place, 0.0], pieces=pieces), [place, 0.0])
