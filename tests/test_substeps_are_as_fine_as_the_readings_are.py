@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from engine_cases import problem, recorded, simulation, solved
+from engine_cases import recorded, simulation, solved
 
-from symplearn.diagnosis._build import first_substep, refined
+from symplearn.diagnosis._build import Restriction, augmented_equations, build, first_substep, refined
 from symplearn.diagnosis._calibrate import weights
 from symplearn.diagnosis._course import courses
 from symplearn.diagnosis._stochastic import free_run
@@ -18,16 +18,22 @@ def _forced(force):
     return f'[forces]\np = "{force}"'
 
 
+def _laid_out(file, recordings):
+    """What lays the problem out with a longest substep, its equations compiled once."""
+    built = augmented_equations(file)
+    return lambda longest: build(file, built, recordings, 0.0, longest, Restriction())
+
+
 def _before_and_after(hamiltonian, more, times, readings, noise):
     """The problem in its first substeps and in those that are fine enough, with the motion from `_START`; and whether
     they are said to be."""
     file = simulation(hamiltonian, more=more)
     recordings = [recorded(times, readings, columns=("y",))]
-    substep = first_substep(file, recordings)
-    first = problem(file, recordings, substep)
+    rebuild, substep = _laid_out(file, recordings), first_substep(file, recordings)
+    first = rebuild(substep)
     z = np.zeros(first.size)
     z[0], z[first.state // 2] = _START
-    fine, _, is_fine = refined(lambda longest: problem(file, recordings, longest), first, z, np.array([noise]), substep)
+    fine, _, is_fine = refined(rebuild, first, z, np.array([noise]), substep)
     return first, fine, z, is_fine
 
 
@@ -75,11 +81,9 @@ def test_a_motion_that_no_halving_settles_is_left_alone():
     energy = "pth**2/2 + (pph - cos(th))**2/(2*sin(th)**2) + 3*cos(th)"
     file = simulation(energy, ("th", "ph"), ("pth", "pph"), {"y": "sin(th)*cos(ph)"})
     recordings = [recorded(times, np.cos(times)[:, None], columns=("y",))]
-    substep = first_substep(file, recordings)
-    first = problem(file, recordings, substep)
+    rebuild, substep = _laid_out(file, recordings), first_substep(file, recordings)
+    first = rebuild(substep)
     z = np.zeros(first.size)
     z[[0, 1, first.state // 2, first.state // 2 + 1]] = -0.09, -1.9, -150.0, -4.4
-    fine, length, is_fine = refined(
-        lambda longest: problem(file, recordings, longest), first, z, np.array([0.01]), substep
-    )
+    fine, length, is_fine = refined(rebuild, first, z, np.array([0.01]), substep)
     assert fine is first and length == substep and not is_fine

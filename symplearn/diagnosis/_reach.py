@@ -32,8 +32,9 @@ def covariance_within_reach(
     problem = stepper.problem
     local = problem.local(recording)
     whole = e.covariance[np.ix_(local, local)] * inflation
+    middle = _readings(stepper, e, recording, np.zeros(len(local)))
     for along in _with_the_start(whole, problem.state):
-        share = _share(stepper, e, recording, along)
+        share = _share(stepper, e, recording, along, middle)
         whole = whole - (1.0 - share**2) * np.outer(along, along)
     return whole
 
@@ -49,9 +50,10 @@ def _with_the_start(whole: Float[np.ndarray, "local local"], state: int) -> Floa
     return (whole[:, free] @ inverse).T
 
 
-def _share(stepper: Stepper, e: Estimate, recording: int, along: Float[np.ndarray, " local"]) -> float:
-    """The largest share of a direction, halved again and again, in which readings are even."""
-    middle = _readings(stepper, e, recording, 0.0 * along)
+def _share(
+    stepper: Stepper, e: Estimate, recording: int, along: Float[np.ndarray, " local"], middle: np.ndarray
+) -> float:
+    """The largest share of a direction, halved again and again, in which readings are even about those of the fit."""
     for share in 0.5 ** np.arange(_HALVINGS):
         both = [_readings(stepper, e, recording, sign * share * along) for sign in (-1.0, 1.0)]
         if float((((both[0] + both[1]) / 2 - middle) ** 2).sum()) <= _BENT:
