@@ -11,7 +11,8 @@ from jaxtyping import Array
 
 from ._effects import CENTRAL, SPRING, Candidate, Effect, PowerForce, vocabulary
 from ._separable import is_separable
-from ._symbolic import derivative, jax_function
+from ._symbolic import derivative
+from ._symbolic_slopes import with_slopes
 from ._terms import Further, Mechanics
 
 # Keeps a central force and its slopes finite where both coordinates are zero; its amplitude is then zero as well.
@@ -111,7 +112,7 @@ def equations(
     arguments = [*coordinates, *momenta, *every, *inputs, sympy.Symbol("t", real=True), *c]
 
     def compiled(expressions: Sequence[sympy.Expr]) -> Callable[[Array], Array]:
-        return jax.jit(jax_function(expressions, arguments))  # so that a tree is walked once, wherever it is called
+        return jax.jit(with_slopes(expressions, arguments))  # so that a tree is walked once, wherever it is called
 
     return Equations(
         coordinates=tuple(names),

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 import integrators as ig
 
 from ._augmented import Equations
-from ._augmented_system import EVERYTHING, Moment, Simulated, SimulatedHamiltonian, Switches
+from ._augmented_system import EVERYTHING, Simulated, SimulatedHamiltonian, Switches
 from ._effects import BIAS, COULOMB, DELAY, DRIFT, GAIN, IMPULSE
 
 # Classical Runge-Kutta: where a stage stands, and its weight.
@@ -73,21 +73,17 @@ class SimulatedFlow(eqx.Module):
         return jax.lax.fori_loop(0, span.pieces, substep, x)
 
     def _substep(self, x: Array, t: Array, dt: Array, inputs: Array) -> Array:
-        parts = self._parts()
-        moments = self.system.moments([t + part.place * dt for part in parts], dt)
         x = self._struck(x, t, dt, inputs)
 
         # Kicks and stages are one loop, so that either is compiled once: unrolled they take minutes to compile.
-        def part(carry: tuple[Array, Array], data: tuple[Moment, Array, Array, Array]) -> tuple[Any, None]:
-            moment, share, ahead, what = data
-            system = self.system.frozen(moment, inputs)
+        def part(carry: tuple[Array, Array], data: tuple[Array, ...]) -> tuple[Any, None]:
+            what, share, place, ahead = data
+            system = self.system.at(t + place * dt, inputs, dt)
             return self._part(system, carry, share * dt, ahead, what), None
 
-        shares = jnp.asarray([part.share for part in parts], x.dtype)
-        aheads = jnp.asarray([part.ahead for part in parts], x.dtype)
-        whats = jnp.asarray([part.what for part in parts])
+        what, *shares = map(np.asarray, zip(*self._parts(), strict=True))
         begin = self.integrator.lift(x), jnp.ones(len(x) // 2, bool)
-        (state, held), _ = jax.lax.scan(part, begin, (moments, shares, aheads, whats))
+        (state, held), _ = jax.lax.scan(part, begin, (what, *(one.astype(x.dtype) for one in shares)))
         q, p = ig.split(self.integrator.project(state))
         # Held at both ends: without this a body at rest would creep through the flow in between.
         return jnp.concatenate([jnp.where(held, ig.split(x)[0], q), p])
@@ -157,7 +153,8 @@ class SimulatedFlow(eqx.Module):
                 jump = size * (jnp.arange(len(x)) == place)
                 return jump + share * dt * (before - system.rates(x + jump))
 
-            return x + jax.vmap(one)(size, share, places).sum(0)
+            # One by one: so the components stay apart (`_componentwise`).
+            return x + jnp.stack([one(*each) for each in zip(size, share, places, strict=True)]).sum(0)
 
         return jax.lax.cond(self.system.switches.impulses, struck, lambda x: x, x)
 
@@ -242,8 +239,8 @@ class SimulatedReading(eqx.Module):
         """h, of the phase point as it was a delay ago."""
 
         def late(x: Array) -> Array:
-            back = jax.vmap(lambda delay: self._back(x, system.moment.time, system.inputs, -delay))(system.of(DELAY))
-            return jnp.diagonal(jax.vmap(lambda x: _shown(system, x))(back))
+            back = [self._back(x, system.moment.time, system.inputs, -delay) for delay in system.of(DELAY)]
+            return jnp.stack([_shown(system, x)[k] for k, x in enumerate(back)])
 
         return jax.lax.cond(self.system.switches.delays, late, lambda x: _shown(system, x), x)
 

@@ -1,6 +1,6 @@
 """The augmented simulation as a Hamiltonian system: its energy with every effect, and forces that a velocity enters."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -162,10 +162,6 @@ class Simulated(eqx.Module):
     def frozen(self, moment: Moment, inputs: Float[Array, " input"]) -> SimulatedHamiltonian:
         """The system with everything that depends on time as it stands at a moment."""
         return SimulatedHamiltonian(self.equations, self.coefficients, self.values, inputs, moment)
-
-    def moments(self, times: Sequence[Array], width: Float[Array, ""]) -> Moment:
-        """Moments of several times, by a leading axis."""
-        return jax.vmap(lambda t: self.moment(t, width))(jnp.stack(list(times)))
 
     def moment(self, t: Float[Array, ""], width: Float[Array, ""] | float) -> Moment:
         """What depends on time alone.

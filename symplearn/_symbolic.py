@@ -4,7 +4,7 @@ Nothing is printed to source and executed (no `lambdify`). Equal subtrees are ev
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import Any
@@ -98,12 +98,15 @@ class ArrayFunction:
         if len(values) != len(self.symbols):
             raise ValueError(f"expected {len(self.symbols)} values {self.symbols}, received {len(values)}")
         # Only what is used: to JAX every entry taken is two operations to trace and to compile.
-        known = {symbol: values[place] for place, symbol in self._used}
-        walk = _Walk(self.operations, values.dtype, values.shape[1:], known)
+        results = self.entries({symbol: values[place] for place, symbol in self._used}, values.dtype, values.shape[1:])
+        return xp.stack(results) if results else xp.zeros((0,), values.dtype)
+
+    def entries(self, known: Mapping[sympy.Basic, Any], dtype: Any, shape: tuple[int, ...]) -> list[Any]:
+        """What the expressions come to where their symbols are `known`, each of this `dtype` and `shape`."""
+        walk = _Walk(self.operations, dtype, shape, dict(known))
         for part in self._order:
             walk(part)
-        results = [walk(e) for e in self.expressions]
-        return xp.stack(results) if results else xp.zeros((0,), values.dtype)
+        return [walk(e) for e in self.expressions]
 
 
 def jax_function(
