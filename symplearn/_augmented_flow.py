@@ -76,7 +76,7 @@ class SimulatedFlow(eqx.Module):
         x = self._struck(x, t, dt, inputs)
 
         # Kicks and stages are one loop, so that either is compiled once: unrolled they take minutes to compile.
-        def part(carry: tuple[Array, Array], data: tuple[Array, ...]) -> tuple[Any, None]:
+        def part(carry: Any, data: Any) -> tuple[Any, None]:
             what, share, place, ahead = data
             system = self.system.at(t + place * dt, inputs, dt)
             return self._part(system, carry, share * dt, ahead, what), None

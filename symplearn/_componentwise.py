@@ -8,7 +8,7 @@ same for all of them and becomes one instruction for four or eight. What comes o
 import math
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
@@ -46,7 +46,10 @@ def _evaluated(program: ClosedJaxpr, values: Sequence[_Value]) -> list[_Value]:
     known.update(zip(inner.invars, values, strict=True))
 
     def value(atom: Any) -> _Value:
-        return _known(np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, Literal) else known[atom]
+        if not isinstance(atom, Literal):
+            return known[atom]
+        shaped: Any = atom.aval
+        return _known(np.asarray(atom.val, shaped.dtype))
 
     for one in inner.eqns:
         known.update(zip(one.outvars, _applied(one, [value(atom) for atom in one.invars]), strict=True))
@@ -78,12 +81,12 @@ def _as_it_is(one: JaxprEqn, values: Sequence[_Value]) -> list[_Value]:
 
 def _each(one: JaxprEqn, values: Sequence[_Value]) -> np.ndarray:
     """An operation that treats every entry alike."""
-    together = np.broadcast_arrays(*values)
+    together, shaped = np.broadcast_arrays(*values), cast(Any, one.outvars[0].aval)
     out, plain = np.empty(together[0].shape, object), _PLAIN.get(one.primitive.name)
     for place in np.ndindex(out.shape):
         entries = [array[place] for array in together]
         if plain and all(isinstance(entry, np.generic) for entry in entries):
-            out[place] = plain(*entries, dtype=one.outvars[0].aval.dtype)
+            out[place] = plain(*entries, dtype=shaped.dtype)
         else:
             out[place] = one.primitive.bind(*entries, **one.params)
     return out
@@ -115,7 +118,7 @@ def _apart(array: Array) -> _Value:
     return out
 
 
-def _whole(value: _Value, shaped: Any) -> Array:
+def _whole(value: _Value, shaped: Any) -> Any:
     """An array of its entries."""
     if not _is_small(shaped):
         return value
@@ -166,7 +169,9 @@ def _while(one: JaxprEqn, values: list[_Value]) -> Sequence[_Value]:
         return _evaluated(p["cond_jaxpr"], [*values[:asked], *map(_bound, carry, shapes)])[0][()]
 
     def body(carry: Any) -> Any:
-        return list(map(_loose, _evaluated(p["body_jaxpr"], [*values[asked:given], *map(_bound, carry, shapes)]), shapes))
+        return list(
+            map(_loose, _evaluated(p["body_jaxpr"], [*values[asked:given], *map(_bound, carry, shapes)]), shapes)
+        )
 
     return list(map(_bound, lax.while_loop(goes_on, body, list(map(_loose, values[given:], shapes))), shapes))
 
@@ -213,9 +218,9 @@ _PLAIN: dict[str, Callable[..., Any]] = {
 }
 # Operations that treat every entry alike.
 _ALIKE = frozenset(
-    "abs acos acosh add add_any and asin asinh atan atan2 atanh ceil clamp convert_element_type copy copy_p cos cosh div "
-    "eq erf exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max min mul ne neg nextafter not "
-    "or pow real rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor".split()
+    "abs acos acosh add add_any and asin asinh atan atan2 atanh ceil clamp convert_element_type copy copy_p cos cosh "
+    "div eq erf exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max min mul ne neg not or "
+    "pow rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor".split()
 )
 
 

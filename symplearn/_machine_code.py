@@ -7,10 +7,8 @@ known; `Unsupported` is raised for all else, which XLA does then.
 
 import math
 from collections.abc import Callable, Sequence
-from functools import reduce
-from typing import Any
+from typing import Any, TypeAlias
 
-import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 from llvmlite import ir
@@ -31,8 +29,8 @@ class Table:
         self.pointer, self.shape, self.type = pointer, shape, type_
 
 
-# One value: a scalar, a register with one entry a direction, a few scalars in an array, or a table.
-Value = ir.Value | np.ndarray | Table
+# A scalar, a register with one entry a direction, a few scalars in an array, or a table.
+Value: TypeAlias = Any
 
 
 class Code:
@@ -47,7 +45,9 @@ class Code:
         known.update(zip(program.jaxpr.invars, values, strict=True))
 
         def value(atom: Any) -> Any:
-            return self._constant(np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, Literal) else known[atom]
+            return (
+                self._constant(np.asarray(atom.val, _shaped(atom).dtype)) if isinstance(atom, Literal) else known[atom]
+            )
 
         for one in program.jaxpr.eqns:
             known.update(zip(one.outvars, self._applied(one, [value(atom) for atom in one.invars]), strict=True))
@@ -139,6 +139,11 @@ def type_of(dtype: Any) -> ir.Type:
     return _TYPES[str(dtype)]
 
 
+def _shaped(atom: Any) -> Any:
+    """Shape and type of what stands for a value in a traced function."""
+    return atom.aval
+
+
 def _wanted(code: Code, value: ir.Value, shaped: Any) -> ir.Value:
     """A value as a loop or a branch yields it: with an entry for every direction if it may differ among them."""
     return code.splat(value) if shaped.shape else value
@@ -152,7 +157,7 @@ def _branches(code: Code, one: JaxprEqn, values: list[Any]) -> list[Any]:
     if one.params.get("branches_platforms") is not None:
         raise Unsupported("a branch by platform")
     index, *operands = values
-    build, shapes = code.builder, [atom.aval for atom in one.outvars]
+    build, shapes = code.builder, list(map(_shaped, one.outvars))
     nothing = [ir.Constant(ir.VectorType(type_of(s.dtype), code.width) if s.shape else type_of(s.dtype), None)
                for s in shapes]  # fmt: skip
     cells, blocks, end = code.cells(nothing), [], build.append_basic_block("joined")
@@ -174,7 +179,7 @@ def _branches(code: Code, one: JaxprEqn, values: list[Any]) -> list[Any]:
 def _while(code: Code, one: JaxprEqn, values: list[Any]) -> list[Any]:
     p, build = one.params, code.builder
     asked, given = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
-    shapes = [atom.aval for atom in one.outvars]
+    shapes = list(map(_shaped, one.outvars))
     cells = code.cells([_wanted(code, v, shaped) for v, shaped in zip(values[given:], shapes, strict=True)])
     again, inside, end = map(build.append_basic_block, ("again", "inside", "end"))
     build.branch(again)
@@ -194,7 +199,7 @@ def _while(code: Code, one: JaxprEqn, values: list[Any]) -> list[Any]:
 def _scan(code: Code, one: JaxprEqn, values: list[Any]) -> list[Any]:
     p, build = one.params, code.builder
     given, last = p["num_consts"], p["num_consts"] + p["num_carry"]
-    shapes, ahead = [atom.aval for atom in one.outvars], values[last:]
+    shapes, ahead = list(map(_shaped, one.outvars)), values[last:]
     if len(shapes) > p["num_carry"] or not all(isinstance(one, Table) and len(one.shape) == 1 for one in ahead):
         raise Unsupported("a loop along arrays")
     zero, length = ir.Constant(INTEGER, 0), ir.Constant(INTEGER, p["length"])
@@ -208,7 +213,9 @@ def _scan(code: Code, one: JaxprEqn, values: list[Any]) -> list[Any]:
     build.position_at_end(inside)
     place = build.sub(build.sub(length, ir.Constant(INTEGER, 1)), k) if p["reverse"] else k
     rows = [code.loaded(table, place) for table in ahead]
-    for cell, value, shaped in zip(cells, code.evaluated(p["jaxpr"], [*values[:given], *now, *rows]), shapes, strict=True):
+    for cell, value, shaped in zip(
+        cells, code.evaluated(p["jaxpr"], [*values[:given], *now, *rows]), shapes, strict=True
+    ):
         build.store(_wanted(code, value, shaped), cell)
     build.store(build.add(k, ir.Constant(INTEGER, 1)), count)
     build.branch(again)
@@ -251,18 +258,18 @@ def _moved(rule: Callable[[np.ndarray, Any], np.ndarray]) -> Callable[[Code, Jax
     """An operation that only picks or orders entries."""
 
     def applied(code: Code, one: JaxprEqn, values: list[Any]) -> list[Any]:
-        value, shape = values[0], one.outvars[0].aval.shape
+        value, shape = values[0], _shaped(one.outvars[0]).shape
         if isinstance(value, ir.Value) and isinstance(value.type, ir.VectorType):
             if math.prod(shape) != code.width:
                 raise Unsupported("a part of a register")
             return [value]
-        return [_scalar(rule(_array(value, one.invars[0].aval.shape), one.params))]
+        return [_scalar(rule(_array(value, _shaped(one.invars[0]).shape), one.params))]
 
     return applied
 
 
 def _spread(code: Code, one: JaxprEqn, values: list[Any]) -> list[Any]:
-    size = math.prod(one.outvars[0].aval.shape)
+    size = math.prod(_shaped(one.outvars[0]).shape)
     if isinstance(values[0], ir.Value) and size in (1, code.width):
         return [code.splat(values[0]) if size > 1 else values[0]]
     raise Unsupported("a value that is spread over an array")
@@ -388,6 +395,11 @@ def _of_library(name: str) -> Callable[..., ir.Value]:
     return lambda code, p, *values: code.called(name, values)
 
 
+# Functions that the C library has by the name that JAX gives them.
+_LIBRARY = (
+    "acos", "acosh", "asin", "asinh", "atan", "atan2", "atanh", "cos", "cosh", "exp", "expm1", "log", "log1p", "pow",
+    "sin", "sinh", "tan", "tanh",
+)  # fmt: skip
 _SCALAR: dict[str, Callable[..., ir.Value]] = {
     "abs": _size,
     "add": _arithmetic("fadd", "add"),
@@ -419,8 +431,5 @@ _SCALAR: dict[str, Callable[..., ir.Value]] = {
     "square": lambda code, p, a: code.builder.fmul(a, a),
     "stop_gradient": lambda code, p, a: a,
     "sub": _arithmetic("fsub", "sub"),
-    **{name: _of_library(name) for name in ("sin", "cos", "tan", "exp", "log", "sinh", "cosh", "tanh", "log1p", "expm1")},
-    **{f"a{name}": _of_library(f"a{name}") for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
-    "atan2": _of_library("atan2"),
-    "pow": _of_library("pow"),
+    **{name: _of_library(name) for name in _LIBRARY},
 }

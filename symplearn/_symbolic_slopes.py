@@ -20,11 +20,10 @@ def with_slopes(
     expressions: Sequence[sympy.Expr], symbols: Sequence[sympy.Symbol]
 ) -> Callable[[Float[Array, "n_symbols ..."]], Float[Array, "n_expressions ..."]]:
     """`jax_function`, differentiated by its expressions' own derivatives; by JAX where these are too large."""
-    plain = jax_function(expressions, symbols)
-    used = [(k, one) for k, one in enumerate(symbols) if any(one in e.free_symbols for e in plain.expressions)]
+    plain, trees = jax_function(expressions, symbols), list(map(sympy.sympify, expressions))
+    used = [(k, one) for k, one in enumerate(symbols) if any(one in e.free_symbols for e in trees)]
     try:
-        table = [[(k, derivative(e, one)) for k, (_, one) in enumerate(used) if one in e.free_symbols]
-                 for e in plain.expressions]  # fmt: skip
+        table = [[(k, derivative(e, one)) for k, (_, one) in enumerate(used) if one in e.free_symbols] for e in trees]
     except TooLarge:
         return plain
     slopes = jax_function([slope for row in table for _, slope in row], symbols)

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 import integrators as ig
 
@@ -88,8 +88,10 @@ def costly(problem: Problem, combination: Combination) -> int:
     return sum(2**k * bool(mine & set(effects)) for k, effects in enumerate(_SWITCHED))
 
 
-def switches_of(problem: Problem, recording: int, hots: Float[np.ndarray, "lane row coefficient"]) -> Switches:
-    """What none of the lanes that are stepped together has, nor any known term."""
+def needed(
+    problem: Problem, recording: int, hots: Float[np.ndarray, "lane row coefficient"]
+) -> Bool[np.ndarray, " switch"]:
+    """Which switches lanes that are stepped together need, for what they have or what is known."""
     eq, c = problem.equations, problem.calibrated
     on = (problem.terms[recording] != 0) | (hots != 0).any((0, 1))
     on[c.place[c.parameters :]] = True
@@ -97,4 +99,4 @@ def switches_of(problem: Problem, recording: int, hots: Float[np.ndarray, "lane 
     def has(effects: Sequence[Effect]) -> bool:
         return any(bool(on[eq.firsts(effect)].any()) for effect in effects) or (IMPULSE in effects and bool(eq.jumping))
 
-    return Switches(*(jnp.asarray(has(effects)) for effects in _SWITCHED))
+    return np.array([has(effects) for effects in _SWITCHED])

@@ -1,69 +1,26 @@
 """Trajectories of many combinations at once, with their sensitivities: one compiled function serves them all."""
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import chain
 from typing import Any, TypeVar
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ._course import costly, courses, effect_coefficients, model_at, switches_of
+from .._machine_code import Unsupported
+from ._batched_steps import LANES as LANES
+from ._batched_steps import BatchedSteps
+from ._course import Course, costly, courses
+from ._lanes import AbstractSteps, Found, Lanes, Threads
+from ._native_rows import WIDTH, native_rows
+from ._native_steps import NativeSteps
 from ._problem import Combination, Problem
 
-DIRECTIONS = 8  # slopes are taken along so many directions at a time, so that one program is compiled
-# Combinations stepped together: a fixed number, so that the answer does not depend on the cores, and a small one, since
-# a lane costs as much among few as among many, and those that are lacking are stepped in vain.
-LANES = 4
+DIRECTIONS = WIDTH  # slopes are taken along so many directions at a time
 
 A = TypeVar("A")
 B = TypeVar("B")
-
-
-@eqx.filter_jit
-def _sensitivities(equations, integrator, course, zs, onehots, directions, rows, switches, paths, anew):
-    """Readings (lane, time, channel) and their slopes (lane, direction, time, channel) over the first `rows` rows.
-
-    Along the last axis the phase points follow the readings, so that one program serves `carried` too, and, where
-    every row begins `anew` at its point of a path (lane, time, state), the linearisation about that path: the phase
-    points are then those that arrive from the row before.
-    """
-    state, f = 2 * equations.width, course.to_parameters.shape[0]
-
-    def readings(z, onehot, path):
-        coefficients = effect_coefficients(z[state + f :], onehot)
-        flow, read = model_at(equations, integrator, course, z[state : state + f], coefficients, switches)
-        moved = z[:state] - jax.lax.stop_gradient(z[:state])  # nothing, with the slope of the start
-
-        def body(k, carry):
-            x, out = carry
-            begun = jnp.where(anew, path[k] + moved, x)
-            seen = read(begun, (course.times[k], course.inputs[k]))
-            out = out.at[k].set(jnp.concatenate([seen, x]))
-            return flow(begun, jax.tree.map(lambda leaf: leaf[k], course.spans)), out
-
-        empty = jnp.zeros((course.times.shape[0], len(equations.columns) + state))
-        return jax.lax.fori_loop(0, rows, body, (z[:state], empty))[1]
-
-    def lane(z, onehot, along, path):
-        # Forward mode: few unknowns, many readings, and a number of rows that is data.
-        slope = lambda tangent: jax.jvp(lambda one: readings(one, onehot, path), (z,), (tangent,))  # noqa: E731
-        return jax.vmap(slope, out_axes=(None, 0))(along)
-
-    return jax.vmap(lane)(zs, onehots, directions, paths)
-
-
-# Arguments of `_sensitivities`, one call for every `DIRECTIONS` directions.
-_Run = list[tuple[Any, ...]]
-
-
-def _arrays(call: tuple[Any, ...]) -> tuple[np.ndarray, np.ndarray]:
-    shown, slopes = _sensitivities(*call)
-    return np.asarray(shown), np.asarray(slopes)
 
 
 @dataclass(frozen=True)
@@ -74,21 +31,33 @@ class Predictions:
     slopes: Float[np.ndarray, "lane local time channel"]
 
 
-class Stepper:
-    """Steps any number of combinations through all recordings, `LANES` at a time, on `jobs` threads."""
+def _steps(problem: Problem, threads: Threads) -> AbstractSteps:
+    """How a problem is stepped: by machine code, where there is one for it and the work is a processor's."""
+    along, p = courses(problem), problem
+    if jax.default_backend() == "cpu":
+        try:
+            return NativeSteps(native_rows(p.equations, p.integrator, along[0].inputs.shape[1]), along, threads)
+        except Unsupported:
+            pass
+    return BatchedSteps(along, threads)
 
-    def __init__(self, problem: Problem, jobs: int = 1):
-        self.problem = problem
-        self.courses = courses(problem)
-        self.no_path = jax.device_put(np.zeros((LANES, len(self.courses[0].times), problem.state)))
-        self.jobs = jobs
-        self._pool, self._compiled = ThreadPoolExecutor(max(1, jobs)), False
+
+class Stepper:
+    """Steps any number of combinations through all recordings on `jobs` threads."""
+
+    def __init__(self, problem: Problem, jobs: int = 1, steps: AbstractSteps | None = None):
+        self.problem, self.threads = problem, Threads(jobs)
+        self.steps = _steps(problem, self.threads) if steps is None else steps
+
+    @property
+    def courses(self) -> Sequence[Course]:
+        """What every recording gives to its trajectories."""
+        return self.steps.courses
 
     def on(self, problem: Problem) -> "Stepper":
         """The same for a problem over the same courses, which differs in which readings count or what bounds values."""
         other = Stepper.__new__(Stepper)
-        other.problem, other.courses, other.no_path = problem, self.courses, self.no_path
-        other.jobs, other._pool, other._compiled = self.jobs, self._pool, self._compiled
+        other.problem, other.threads, other.steps = problem, self.threads, self.steps
         return other
 
     def predict(
@@ -96,77 +65,31 @@ class Stepper:
     ) -> list[Predictions]:
         """Predictions by recording, over its first `rows[r]` rows."""
         p, alike = self.problem, self._alike(combinations)
-        chunks = [alike[a : a + LANES] for a in range(0, len(zs), LANES)]
-        work, runs = [], []
+        some, runs = [combinations[k] for k in alike], []
         for r in range(len(self.courses)):
-            for chunk in chunks:
-                local, some = p.local(r), [combinations[k] for k in chunk]
-                free = [np.nonzero(p.active(c)[local])[0] for c in some]
-                hots = np.stack([p.onehot(c, r) for c in some])
-                work.append((r, free))
-                runs.append(self._run(r, zs[chunk][:, local], hots, free, rows[r]))
-        parts = [self._spread(*one, *found, rows) for one, found in zip(work, self._stepped(runs), strict=True)]
+            local = p.local(r)
+            free = [np.nonzero(p.active(c)[local])[0] for c in some]
+            hots = np.stack([p.onehot(c, r) for c in some])
+            runs.append(Lanes(r, zs[alike][:, local], hots, free, rows[r]))
         back = np.argsort(alike)
-        return [_joined(parts[r * len(chunks) : (r + 1) * len(chunks)], back) for r in range(len(self.courses))]
+        return [self._spread(run, found, back) for run, found in zip(runs, self.steps(p, runs), strict=True)]
 
     def _alike(self, combinations: Sequence[Combination]) -> Int[np.ndarray, " lane"]:
         """Lanes in an order in which those of the same cost come together, by what acts and by how many directions."""
         calls = [-(-int(self.problem.active(c).sum()) // DIRECTIONS) for c in combinations]
         return np.lexsort((calls, [costly(self.problem, c) for c in combinations]))
 
-    def _spread(
-        self, r: int, free: Sequence[np.ndarray], shown: np.ndarray, along: np.ndarray, rows: Sequence[int]
-    ) -> Predictions:
-        """Predictions of some lanes whose slopes are known along their `free` entries."""
-        p, number = self.problem, len(free)
-        slopes = np.zeros((number, len(p.local(r)), rows[r], p.channels))
-        for lane, places in enumerate(free):
-            slopes[lane, places] = along[lane, : len(places), : rows[r], : p.channels]
-        return Predictions(shown[:number, : rows[r], : p.channels], slopes)
-
-    def _run(
-        self, r: int, local_z: np.ndarray, hots: np.ndarray, along: Sequence[np.ndarray], rows: int,
-        paths: np.ndarray | None = None,
-    ) -> _Run:  # fmt: skip
-        """What yields readings and phase points of at most `LANES` lanes and their slopes along the entries that
-        `along` names; with `paths` every row begins anew at its own."""
-        number, p = len(local_z), self.problem
-        lanes = np.arange(LANES) % number
-        width = -(-max(1, *map(len, along)) // DIRECTIONS) * DIRECTIONS
-        directions = np.zeros((number, width, local_z.shape[1]))
-        for lane, places in enumerate(along):
-            directions[lane, np.arange(len(places)), places] = 1.0
-        some, matrices = (jax.device_put(a[lanes]) for a in (local_z, hots))
-        last, switches, anew = jnp.asarray(rows), switches_of(p, r, hots), jnp.asarray(paths is not None)
-        begun = self.no_path if paths is None else jax.device_put(paths[lanes])
-        return [
-            (
-                p.equations, p.integrator, self.courses[r], some, matrices,
-                jax.device_put(directions[lanes, k : k + DIRECTIONS]), last, switches, begun, anew,
-            )
-            for k in range(0, width, DIRECTIONS)
-        ]  # fmt: skip
-
-    def _stepped(self, runs: Sequence[_Run]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """What runs yield, of `LANES` lanes each: side by side on all threads, which wait for nothing but these.
-
-        The very first goes before, or every thread would compile it.
-        """
-        calls = [call for run in runs for call in run]
-        alone = [] if self._compiled else [_arrays(calls.pop(0))]
-        self._compiled = True
-        side_by_side = self.jobs > 1 and len(calls) > 1
-        done = chain(alone, self._pool.map(_arrays, calls) if side_by_side else map(_arrays, calls))
-        found = [[next(done) for _ in run] for run in runs]
-        return [(parts[0][0], np.concatenate([slopes for _, slopes in parts], axis=1)) for parts in found]
+    def _spread(self, run: Lanes, found: Found, order: Int[np.ndarray, " lane"]) -> Predictions:
+        """Predictions of lanes in an order."""
+        p = self.problem
+        slopes = np.zeros((len(run.z), run.z.shape[1], run.rows, p.channels))
+        for lane, (places, along) in enumerate(zip(run.along, found.slopes, strict=True)):
+            slopes[lane, places] = along[..., : p.channels]
+        return Predictions(found.shown[order, :, : p.channels], slopes[order])
 
     def ahead(self, work: Callable[[A], B], items: Sequence[A]) -> Iterator[B]:
         """The work on every item in order, on all threads while what comes before is being used."""
-        if self.jobs < 2 or len(items) < 2:
-            yield from map(work, items)
-            return
-        with ThreadPoolExecutor(self.jobs) as pool:
-            yield from pool.map(work, items)
+        return self.threads.ahead(work, items)
 
     def responses(
         self, z: Float[np.ndarray, " z"], combination: Combination, laid: Sequence[Any], rows: int, r: int
@@ -181,11 +104,11 @@ class Stepper:
         for _, matrix, amplitudes in laid:
             unseen = [p.equations.width - 1, 2 * p.equations.width - 1] if matrix[-1].any() else []
             along.append(np.concatenate([unseen, self._further + np.concatenate(amplitudes)]).astype(int))
-        ((_, slopes),) = self._stepped([self._run(r, some, hots, along, rows)])
+        (found,) = self.steps(p, [Lanes(r, some, hots, along, rows)])
         out = []
-        for lane, places in enumerate(along):
+        for places, slopes in zip(along, found.slopes, strict=True):
             full = np.zeros((len(local), rows, p.channels))
-            full[places] = slopes[lane, : len(places), :rows, : p.channels]
+            full[places] = slopes[..., : p.channels]
             out.append(full)
         return out
 
@@ -204,10 +127,8 @@ class Stepper:
         some, hots = self._beside(lanes, r)
         start = np.arange(self.problem.state)
         along = [self._further + np.concatenate(one[2]) if one[2] else start for _, _, one in lanes]
-        parts = [slice(a, a + LANES) for a in range(0, len(along), LANES)]
-        done = self._stepped([self._run(r, some[few], hots[few], along[few], rows) for few in parts])
-        return [(x[:rows], own[: len(places), :rows]) for few, found in zip(parts, done, strict=True)
-                for x, own, places in zip(*found, along[few], strict=False)]  # fmt: skip
+        (found,) = self.steps(self.problem, [Lanes(r, some, hots, along, rows)])
+        return list(zip(found.shown, found.slopes, strict=True))
 
     def about_paths(
         self, paths: Float[np.ndarray, "lane time state"], values: Float[np.ndarray, "lane theta"], hots: np.ndarray,
@@ -220,14 +141,12 @@ class Stepper:
         """
         p, (lanes, rows, state) = self.problem, paths.shape
         local_z = np.concatenate([np.zeros((lanes, state)), values], axis=1)
-        whole = np.zeros((lanes, len(self.courses[r].times), state))
-        whole[:, :rows] = paths
         along = [np.concatenate([p.moving(hot[-1]), self._further + own]) for hot, own in zip(hots, slots, strict=True)]
-        ((out, found),) = self._stepped([self._run(r, local_z, hots, along, rows, whole)])
-        slopes = np.zeros((lanes, local_z.shape[1], rows, out.shape[-1]))
+        (found,) = self.steps(p, [Lanes(r, local_z, hots, along, rows, paths)])
+        slopes = np.zeros((lanes, local_z.shape[1], rows, found.shown.shape[-1]))
         for lane, places in enumerate(along):
-            slopes[lane, places] = found[lane, : len(places), :rows]
-        return out[:lanes, :rows], slopes
+            slopes[lane, places] = found.slopes[lane]
+        return found.shown, slopes
 
     @property
     def _further(self) -> int:
@@ -250,7 +169,3 @@ class Stepper:
             some.append(own)
             hots.append(hot)
         return np.stack(some), np.stack(hots)
-
-
-def _joined(parts: list[Predictions], order: np.ndarray) -> Predictions:
-    return Predictions(*(np.concatenate([getattr(p, f) for p in parts])[order] for f in ("readings", "slopes")))

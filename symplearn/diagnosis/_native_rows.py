@@ -12,7 +12,7 @@ import llvmlite.binding as llvm
 import numpy as np
 from jax import ShapeDtypeStruct
 from jax.extend.core import ClosedJaxpr
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from llvmlite import ir
 
 import integrators as ig
@@ -21,14 +21,14 @@ from .._augmented import Equations
 from .._augmented_flow import SimulatedFlow, SimulatedReading, Span
 from .._augmented_system import Switches
 from .._componentwise import componentwise
-from .._machine_code import DOUBLE, INTEGER, Code, Table, type_of
+from .._machine_code import DOUBLE, INTEGER, Code, Table
 from ._course import Course
 
 WIDTH = 8  # directions in one register
 # Rows of a table whose number is not known when its code is written; they are never counted.
 _MANY = 1 << 30
 _SWITCHES = len(jax.tree.leaves(Switches()))
-_POINTERS = 16
+_POINTERS = 12
 
 
 @dataclass(frozen=True)
@@ -66,28 +66,27 @@ class NativeRows:
 
     def __init__(self, equations: Equations, integrator: ig.AbstractIntegrator, inputs: int):
         sizes = 2 * equations.width, len(equations.parameters), equations.size
-        self.shown = len(equations.columns) + sizes[0]
-        module = _module(_traced(equations, integrator, sizes, inputs), sizes, inputs)
-        self._engine = _compiled(module)
+        self.state, self.shown = sizes[0], len(equations.columns) + sizes[0]
+        self._engine = _compiled(_module(_traced(equations, integrator, sizes, inputs), sizes, inputs))
         kinds = [ctypes.c_int64, ctypes.c_int64, *[ctypes.c_void_p] * _POINTERS]
         self._run = ctypes.CFUNCTYPE(None, *kinds)(self._engine.get_function_address("rows"))
 
     def __call__(
-        self, values: Sequence[np.ndarray], slopes: Sequence[np.ndarray], rail: Rail, switches: np.ndarray, rows: int,
-        path: np.ndarray | None = None,
-    ) -> tuple[Float[np.ndarray, "time shown"], Float[np.ndarray, "time shown direction"]]:  # fmt: skip
-        """From `values` of the start, the parameters and the coefficients, and their `slopes` (entry, direction).
+        self, values: Float[np.ndarray, " taken"], slopes: Float[np.ndarray, "taken direction"], rail: Rail,
+        switches: Bool[np.ndarray, " switch"], path: Float[np.ndarray, "time state"] | None,
+        out: Float[np.ndarray, "time shown"], along: Float[np.ndarray, "direction time shown"],
+    ) -> None:  # fmt: skip
+        """Write the rows to `out` and `along`, from the values of the start, the parameters and the coefficients, end
+        to end, and their slopes.
 
         Phase points stand beside the readings; with a `path` they are those that arrive from its row before.
         """
-        out, along = np.empty((rows, self.shown)), np.empty((rows, self.shown, WIDTH))
-        pairs = [np.ascontiguousarray(a, float) for pair in zip(values, slopes, strict=True) for a in pair]
-        arrays = [*pairs, *rail.arrays, np.ascontiguousarray(switches, np.int8)]
-        begun = None if path is None else np.ascontiguousarray(path, float)
+        arrays = values, slopes, *rail.arrays, switches, *(() if path is None else (path,)), out, along
+        assert all(array.flags.c_contiguous for array in arrays), "the machine reads what lies end to end"
+        first = [array.ctypes.data for array in (values, slopes, *rail.arrays, switches)]
         stride = int(np.prod(rail.means.shape[1:]))
-        places = [a.ctypes.data for a in arrays], None if begun is None else begun.ctypes.data
-        self._run(rows, stride, *places[0], places[1], out.ctypes.data, along.ctypes.data)
-        return out, along
+        begun = None if path is None else path.ctypes.data
+        self._run(len(out), stride, *first, begun, out.ctypes.data, along.ctypes.data)
 
 
 def _traced(equations: Equations, integrator: ig.AbstractIntegrator, sizes: Sequence[int], inputs: int) -> ClosedJaxpr:
@@ -103,7 +102,8 @@ def _traced(equations: Equations, integrator: ig.AbstractIntegrator, sizes: Sequ
         model = equations, _vector(parameters), _vector(coefficients), Switches(*switches)
         flow = SimulatedFlow(model[0], integrator, *model[1:])
         read = SimulatedReading(*model)
-        return tuple(read(_vector(x), (t, _vector(u)))), tuple(flow(_vector(x), Span(*span[:2], means, span[2])))
+        after = flow(_vector(x), Span(span[0], span[1], means, span[2]))
+        return tuple(read(_vector(x), (t, _vector(u)))), tuple(after)
 
     def moved(values: Any, slopes: Any, moment: Any, span: Any, switches: Any) -> Any:
         step = lambda *free: componentwise(row)(*free, moment, span, switches)  # noqa: E731
@@ -120,7 +120,15 @@ def _module(program: ClosedJaxpr, sizes: Sequence[int], inputs: int) -> ir.Modul
     """The function `rows`: a traced row, again and again."""
     module = ir.Module("trajectory")
     pointer = DOUBLE.as_pointer()
-    kinds = [INTEGER, INTEGER, *[pointer] * 10, INTEGER.as_pointer(), pointer, ir.IntType(8).as_pointer(), *[pointer] * 3]
+    kinds = [
+        INTEGER,
+        INTEGER,
+        *[pointer] * 6,
+        INTEGER.as_pointer(),
+        pointer,
+        ir.IntType(8).as_pointer(),
+        *[pointer] * 3,
+    ]
     function = ir.Function(module, ir.FunctionType(ir.VoidType(), kinds), "rows")
     _Rows(program, function, sizes, inputs).write()
     return module
@@ -133,17 +141,15 @@ class _Rows:
         self.program, self.sizes, self.inputs = program, sizes, inputs
         self.build = ir.IRBuilder(function.append_basic_block("entry"))
         self.code = Code(self.build, WIDTH)
-        (self.rows, self.stride, x, dx, p, dp, c, dc, self.times, self.u, self.starts, self.steps, self.pieces,
+        (self.rows, self.stride, self.values, self.slopes, self.times, self.u, self.starts, self.steps, self.pieces,
          self.means, self.switches, self.path, self.out, self.along) = function.args  # fmt: skip
-        self.values, self.slopes = (x, p, c), (dx, dp, dc)
 
     def write(self) -> None:
         build, state = self.build, self.sizes[0]
-        values = [[self.entry(a, self.place(k)) for k in range(n)] for a, n in zip(self.values, self.sizes, strict=True)]
-        slopes = [[self.register(a, self.place(k)) for k in range(n)]
-                  for a, n in zip(self.slopes, self.sizes, strict=True)]  # fmt: skip
+        values = [self.entry(self.values, self.place(k)) for k in range(sum(self.sizes))]
+        slopes = [self.register(self.slopes, self.place(k)) for k in range(sum(self.sizes))]
         on = [build.trunc(self.entry(self.switches, self.place(k)), ir.IntType(1)) for k in range(_SWITCHES)]
-        count, *cells = self.code.cells([self.place(0), *values[0], *slopes[0]])
+        count, *cells = self.code.cells([self.place(0), *values[:state], *slopes[:state]])
         anew = build.icmp_unsigned("!=", self.path, ir.Constant(self.path.type, None))
         again, inside, end = map(build.append_basic_block, ("rows", "row", "done"))
         build.branch(again)
@@ -151,8 +157,8 @@ class _Rows:
         k, *now = [build.load(cell) for cell in (count, *cells)]
         build.cbranch(build.icmp_signed("<", k, self.rows), inside, end)
         build.position_at_end(inside)
-        begun = self.begun(anew, k, now, slopes[0])
-        given = [*begun[:state], *values[1], *values[2], *begun[state:], *slopes[1], *slopes[2], *self.given(k), *on]
+        begun = self.begun(anew, k, now, slopes)
+        given = [*begun[:state], *values[state:], *begun[state:], *slopes[state:], *self.given(k), *on]
         found = self.code.evaluated(self.program, given)
         shown = (len(found) - 2 * state) // 2
         seen, new, seen_along, new_along = np.split(np.array(found, object), np.cumsum([shown, state, shown]))
@@ -199,15 +205,15 @@ class _Rows:
         return [self.entry(self.times, k), *u, *spans, *means]
 
     def told(self, k: ir.Value, values: Sequence[ir.Value], slopes: Sequence[ir.Value]) -> None:
-        """Write down one row."""
-        build = self.build
-        first = build.mul(k, self.place(len(values)))
+        """Write down one row, and its slopes, one direction after the other."""
+        build, shown = self.build, self.place(len(values))
+        first, apart = build.mul(k, shown), build.mul(self.rows, shown)
         for j, (value, slope) in enumerate(zip(values, slopes, strict=True)):
-            place = build.add(first, self.place(j))
+            place, wide = build.add(first, self.place(j)), self.code.splat(slope)
             build.store(value, build.gep(self.out, [place]))
-            cell = build.gep(self.along, [build.mul(place, self.place(WIDTH))])
-            wide = self.code.splat(slope)
-            build.store(wide, build.bitcast(cell, wide.type.as_pointer()), align=8)
+            for direction in range(WIDTH):
+                cell = build.gep(self.along, [build.add(place, build.mul(apart, self.place(direction)))])
+                build.store(build.extract_element(wide, ir.Constant(ir.IntType(32), direction)), cell)
 
 
 def _compiled(module: ir.Module) -> Any:

@@ -1,0 +1,58 @@
+"""Trajectories with their sensitivities by machine code, lane by lane."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from ._course import Course, needed
+from ._lanes import AbstractSteps, Found, Lanes, Threads
+from ._native_rows import WIDTH, NativeRows, Rail
+from ._problem import Problem
+
+
+class NativeSteps(AbstractSteps):
+    """Steps every lane on its own, `WIDTH` directions at a time."""
+
+    def __init__(self, native: NativeRows, courses: Sequence[Course], threads: Threads):
+        self.native, self.courses, self.threads = native, courses, threads
+        self.rails = [Rail.of(course) for course in courses]
+        self.links = [_link(course, native.state) for course in courses]
+
+    def __call__(self, problem: Problem, runs: Sequence[Lanes]) -> list[Found]:
+        work = [(problem, run, lane) for run in runs for lane in range(len(run.z))]
+        done = self.threads.each(lambda one: self._lane(*one), work)
+        out = []
+        for run in runs:
+            shown, slopes = zip(*(next(done) for _ in range(len(run.z))), strict=True)
+            out.append(Found(np.stack(shown), slopes))
+        return out
+
+    def _lane(self, problem: Problem, run: Lanes, lane: int) -> tuple[np.ndarray, np.ndarray]:
+        """Readings and phase points of one lane, and their slopes."""
+        r, z, hot, places = run.recording, run.z[lane], run.hots[lane], run.along[lane]
+        known, links = self.links[r]
+        table = np.concatenate([links, np.pad(hot[:-1], [(0, 0), (known.size - hot.shape[1], 0)])])
+        values = known + z @ table
+        values[known.size - hot.shape[1] :] += hot[-1]
+        blocks = -(-max(1, len(places)) // WIDTH)
+        free = np.zeros((blocks * WIDTH, known.size))
+        free[: len(places)] = table[places]
+        slopes = np.ascontiguousarray(free.reshape(blocks, WIDTH, -1).transpose(0, 2, 1))
+        path = None if run.paths is None else np.ascontiguousarray(run.paths[lane])
+        out, along = np.empty((run.rows, self.native.shown)), np.empty((blocks * WIDTH, run.rows, self.native.shown))
+        switches = needed(problem, r, hot[None])
+        for k, block in enumerate(slopes):
+            self.native(values, block, self.rails[r], switches, path, out, along[k * WIDTH : (k + 1) * WIDTH])
+        return out, along[: len(places)]
+
+
+def _link(course: Course, state: int) -> tuple[Float[np.ndarray, " taken"], Float[np.ndarray, "known taken"]]:
+    """What the machine takes where all unknowns are zero, and what each unknown but the slots adds to it."""
+    parameters, terms, to_parameters, to_coefficients = map(
+        np.asarray, (course.parameters, course.terms, course.to_parameters, course.to_coefficients)
+    )
+    known = np.concatenate([np.zeros(state), parameters, terms])
+    rows = np.concatenate([to_parameters, to_coefficients], axis=1)
+    start = np.eye(state, known.size)
+    return known, np.concatenate([start, np.pad(rows, [(0, 0), (state, 0)])])
