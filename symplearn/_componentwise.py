@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 from jaxtyping import Array
 
 # Arrays of more entries stay whole: what is recorded along a trajectory, but no phase point and no parameters.
@@ -73,10 +73,9 @@ def _applied(one: JaxprEqn, values: list[_Value]) -> Sequence[_Value]:
 
 def _as_it_is(one: JaxprEqn, values: Sequence[_Value]) -> list[_Value]:
     """An operation on whole arrays."""
-    taken = {atom: _whole(value, atom.aval) for value, atom in zip(values, one.invars, strict=True)
-             if not isinstance(atom, Literal)}  # fmt: skip
-    program = Jaxpr((), list(taken), one.outvars, [one], one.effects)
-    return list(map(_apart, jaxpr_as_fun(ClosedJaxpr(program, ()))(*taken.values())))
+    whole = [_whole(value, atom.aval) for value, atom in zip(values, one.invars, strict=True)]
+    done = one.primitive.bind(*whole, **one.primitive.get_bind_params(one.params))
+    return list(map(_apart, done if one.primitive.multiple_results else [done]))
 
 
 def _each(one: JaxprEqn, values: Sequence[_Value]) -> np.ndarray:
