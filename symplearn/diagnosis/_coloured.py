@@ -24,8 +24,9 @@ _TIMES = 10
 MOST_ROWS = 4000
 # Lanes whitened together.
 _LANES = 8
-# Rows are filled up to a multiple of this, so that recordings share compiled functions.
-_ROUND = 512
+# Rows are filled up to a power of two, at least the first of these, or to a multiple of the second, so that recordings
+# share compiled functions.
+_LEAST, _ROUND = 64, 512
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,8 @@ def row_gaps(times: np.ndarray) -> Array:
 
 def filled(values: np.ndarray) -> Array:
     """Rows filled up with zeros to a round number: missing ones without gaps, which change nothing."""
-    lack = -values.shape[-1] % _ROUND
+    rows = max(values.shape[-1], _LEAST)
+    lack = (min(1 << (rows - 1).bit_length(), rows + -rows % _ROUND)) - values.shape[-1]
     return jax.device_put(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, lack)]))
 
 
