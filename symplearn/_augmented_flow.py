@@ -153,8 +153,7 @@ class SimulatedFlow(eqx.Module):
                 jump = size * (jnp.arange(len(x)) == place)
                 return jump + share * dt * (before - system.rates(x + jump))
 
-            # One by one: so the components stay apart (`_componentwise`).
-            return x + jnp.stack([one(*each) for each in zip(size, share, places, strict=True)]).sum(0)
+            return x + jax.vmap(one)(size, share, places).sum(0)
 
         return jax.lax.cond(self.system.switches.impulses, struck, lambda x: x, x)
 
@@ -239,8 +238,9 @@ class SimulatedReading(eqx.Module):
         """h, of the phase point as it was a delay ago."""
 
         def late(x: Array) -> Array:
-            back = [self._back(x, system.moment.time, system.inputs, -delay) for delay in system.of(DELAY)]
-            return jnp.stack([_shown(system, x)[k] for k, x in enumerate(back)])
+            back = jax.vmap(lambda delay: self._back(x, system.moment.time, system.inputs, -delay))(system.of(DELAY))
+            shown = jax.vmap(lambda x: _shown(system, x))(back)
+            return jnp.stack([row[k] for k, row in enumerate(shown)])
 
         return jax.lax.cond(self.system.switches.delays, late, lambda x: _shown(system, x), x)
 

@@ -1,0 +1,371 @@
+"""How single numbers and their slopes along many directions are worked out, operation by operation."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+from llvmlite import ir
+
+DOUBLE, INTEGER = ir.DoubleType(), ir.IntType(64)
+_BIT, _SHORT = ir.IntType(1), ir.IntType(32)
+_TYPES = {"float64": DOUBLE, "bool": _BIT, "int32": _SHORT, "int64": INTEGER}
+
+
+class Unsupported(Exception):
+    """An operation, or a type, that is not made into machine code here."""
+
+
+@dataclass(frozen=True)
+class Dual:
+    """A number, and its slopes in one register; None where nothing moves it.
+
+    Where slopes are themselves worked with as numbers, the value is a register, or None for one of zeros.
+    """
+
+    value: Any
+    slope: Any = None
+
+
+def type_of(dtype: Any) -> ir.Type:
+    """The machine's type of an array's entries."""
+    if str(dtype) not in _TYPES:
+        raise Unsupported(f"numbers of type {dtype}")
+    return _TYPES[str(dtype)]
+
+
+def known(dual: Dual) -> Any:
+    """What a constant is; None for anything else."""
+    return dual.value.constant if isinstance(dual.value, ir.Constant) else None
+
+
+class Arithmetic:
+    """Writes arithmetic of numbers and of registers."""
+
+    def __init__(self, builder: ir.IRBuilder, width: int):
+        self.builder, self.width, self.register = builder, width, ir.VectorType(DOUBLE, width)
+
+    def ruled(self, one: JaxprEqn, entries: Sequence[Dual]) -> Dual:
+        """What an operation makes of some numbers."""
+        name = one.primitive.name
+        if any(entry.value is None for entry in entries):
+            return self._of_nothing(name, entries)
+        if name in _PLAIN and all(known(entry) is not None for entry in entries):
+            shaped: Any = one.outvars[0].aval
+            kind = type_of(shaped.dtype)
+            return Dual(ir.Constant(kind, _PLAIN[name](*(known(e) for e in entries), like=np.dtype(shaped.dtype).type)))
+        return RULES[name](self, one.params, *entries)
+
+    def _of_nothing(self, name: str, entries: Sequence[Dual]) -> Dual:
+        """What an operation makes of slopes that are all zero: it is linear in them."""
+        some = [entry for entry in entries if entry.value is not None]
+        if name in ("mul", "neg", "convert_element_type", "copy") or not some:
+            return Dual(None)
+        if name in ("add", "add_any"):
+            return some[0]
+        raise Unsupported(f"{name} of slopes")
+
+    def slope(self, dual: Dual) -> ir.Value:
+        """The slopes of a number, zeros where there are none."""
+        return ir.Constant(self.register, None) if dual.slope is None else self.wide(dual.slope)
+
+    def wide(self, value: ir.Value) -> ir.Value:
+        """A register with the same in every direction."""
+        if isinstance(value.type, ir.VectorType):
+            return value
+        empty = ir.Constant(ir.VectorType(value.type, self.width), ir.Undefined)
+        first = self.builder.insert_element(empty, value, ir.Constant(_SHORT, 0))
+        places = ir.Constant(ir.VectorType(_SHORT, self.width), [0] * self.width)
+        return self.builder.shuffle_vector(first, empty, places)
+
+    def pair(self, a: ir.Value, b: ir.Value) -> tuple[ir.Value, ir.Value]:
+        """Two numbers, or two registers where one of them is."""
+        if isinstance(a.type, ir.VectorType) or isinstance(b.type, ir.VectorType):
+            return self.wide(a), self.wide(b)
+        return a, b
+
+    def number(self, value: float) -> ir.Constant:
+        return ir.Constant(DOUBLE, float(value))
+
+    def plus(self, a: Any, b: Any) -> Any:
+        """A sum; None is nothing."""
+        if a is None or b is None:
+            return b if a is None else a
+        return self.builder.fadd(*self.pair(a, b), flags=("contract",))
+
+    def minus(self, a: Any, b: Any) -> Any:
+        if a is None or b is None:
+            return a if b is None else self.builder.fneg(b)
+        return self.builder.fsub(*self.pair(a, b), flags=("contract",))
+
+    def times(self, a: Any, b: Any) -> Any:
+        """A product; None is nothing."""
+        if a is None or b is None:
+            return None
+        return self.builder.fmul(*self.pair(a, b), flags=("contract",))
+
+    def over(self, a: ir.Value, b: ir.Value) -> ir.Value:
+        return self.builder.fdiv(*self.pair(a, b))
+
+    def chosen(self, which: ir.Value, yes: ir.Value, no: ir.Value) -> ir.Value:
+        """One of two, numbers or registers."""
+        return self.builder.select(which, *self.pair(yes, no))
+
+    def called(self, name: str, *values: ir.Value) -> ir.Value:
+        """A function of the C library."""
+        kind = ir.FunctionType(DOUBLE, [DOUBLE] * len(values))
+        return self.builder.call(
+            self.builder.module.globals.get(name) or ir.Function(self.builder.module, kind, name), values
+        )
+
+    def built_in(self, name: str, *values: ir.Value) -> ir.Value:
+        """A function that LLVM knows."""
+        return self.called(f"llvm.{name}.f64", *values)
+
+    def power(self, a: ir.Value, exponent: int) -> ir.Value:
+        """An integer power by squaring."""
+        left, square, out = abs(exponent), a, None
+        while left:
+            if left & 1:
+                out = square if out is None else self.times(out, square)
+            left >>= 1
+            square = self.times(square, square) if left else square
+        out = self.number(1.0) if out is None else out
+        return self.over(self.number(1.0), out) if exponent < 0 else out
+
+
+def _is_real(dual: Dual) -> bool:
+    kind = dual.value.type
+    return (kind.element if isinstance(kind, ir.VectorType) else kind) == DOUBLE
+
+
+_Rule = Callable[..., Dual]
+
+
+def _linear(real: str, whole: str) -> _Rule:
+    def rule(on: Arithmetic, p: Any, a: Dual, b: Dual) -> Dual:
+        if not _is_real(a):
+            return Dual(getattr(on.builder, whole)(a.value, b.value))
+        what = getattr(on, real)
+        return Dual(what(a.value, b.value), what(a.slope, b.slope))
+
+    return rule
+
+
+def _product(on: Arithmetic, p: Any, a: Dual, b: Dual) -> Dual:
+    if not _is_real(a):
+        return Dual(on.builder.mul(a.value, b.value))
+    return Dual(on.times(a.value, b.value), on.plus(on.times(a.slope, b.value), on.times(a.value, b.slope)))
+
+
+def _quotient(on: Arithmetic, p: Any, a: Dual, b: Dual) -> Dual:
+    if not _is_real(a):
+        return Dual(on.builder.sdiv(a.value, b.value))
+    value, left = on.over(a.value, b.value), None
+    if a.slope is not None or b.slope is not None:
+        left = on.minus(a.slope, on.times(value, b.slope))
+        left = on.times(left, on.over(on.number(1.0), b.value))
+    return Dual(value, left)
+
+
+def _compared(sign: str) -> _Rule:
+    def rule(on: Arithmetic, p: Any, a: Dual, b: Dual) -> Dual:
+        if not _is_real(a):
+            return Dual(on.builder.icmp_signed(sign, a.value, b.value))
+        compare = on.builder.fcmp_unordered if sign == "!=" else on.builder.fcmp_ordered
+        return Dual(compare(sign, a.value, b.value))
+
+    return rule
+
+
+def _larger(sign: str) -> _Rule:
+    def rule(on: Arithmetic, p: Any, a: Dual, b: Dual) -> Dual:
+        build = on.builder
+        if not _is_real(a):
+            return Dual(build.select(build.icmp_signed(sign, a.value, b.value), a.value, b.value))
+        first = build.fcmp_ordered(sign, a.value, b.value)
+        # What is no number stays so, on either side.
+        value = build.select(build.or_(first, build.fcmp_unordered("uno", a.value, a.value)), a.value, b.value)
+        if a.slope is None and b.slope is None:
+            return Dual(value)
+        half, one, none = map(on.number, (0.5, 1.0, 0.0))
+        tied = build.select(build.fcmp_ordered("==", a.value, b.value), half, none)  # as JAX has it
+        weight = build.select(first, one, tied)
+        return Dual(value, on.plus(on.times(weight, a.slope), on.times(on.minus(one, weight), b.slope)))
+
+    return rule
+
+
+def _bounded(on: Arithmetic, p: Any, low: Dual, a: Dual, high: Dual) -> Dual:
+    build = on.builder
+    value = RULES["min"](on, p, RULES["max"](on, p, Dual(a.value), Dual(low.value)), Dual(high.value)).value
+    if a.slope is None:
+        return Dual(value)
+    inside = build.and_(build.fcmp_ordered("<", low.value, a.value), build.fcmp_ordered("<", a.value, high.value))
+    return Dual(value, on.chosen(inside, on.slope(a), ir.Constant(on.register, None)))
+
+
+def _integer_power(on: Arithmetic, p: Any, a: Dual) -> Dual:
+    y = p["y"]
+    if not _is_real(a) or y == 0:
+        raise Unsupported("a power of an integer, or of none")
+    rate = None if a.slope is None else on.times(on.number(y), on.power(a.value, y - 1))
+    return Dual(on.power(a.value, y), on.times(rate, a.slope))
+
+
+def _power(on: Arithmetic, p: Any, a: Dual, b: Dual) -> Dual:
+    value, slope = on.called("pow", a.value, b.value), None
+    if a.slope is not None:
+        rate = on.times(b.value, on.called("pow", a.value, on.minus(b.value, on.number(1.0))))
+        slope = on.times(rate, a.slope)
+    if b.slope is not None:
+        zero = on.builder.fcmp_ordered("==", a.value, on.number(0.0))
+        log = on.built_in("log", on.builder.select(zero, on.number(1.0), a.value))  # as JAX has it
+        slope = on.plus(slope, on.times(on.times(log, value), b.slope))
+    return Dual(value, slope)
+
+
+def _direction(on: Arithmetic, p: Any, y: Dual, x: Dual) -> Dual:
+    value, slope = on.called("atan2", y.value, x.value), None
+    if y.slope is not None or x.slope is not None:
+        square = on.plus(on.times(x.value, x.value), on.times(y.value, y.value))
+        slope = on.minus(on.times(on.over(x.value, square), y.slope), on.times(on.over(y.value, square), x.slope))
+    return Dual(value, slope)
+
+
+def _sign(on: Arithmetic, a: ir.Value) -> ir.Value:
+    stays = on.builder.fcmp_unordered("ueq", a, on.number(0.0))  # zeros, and what is no number
+    return on.builder.select(stays, a, on.built_in("copysign", on.number(1.0), a))
+
+
+def _size(on: Arithmetic, p: Any, a: Dual) -> Dual:
+    if not _is_real(a):
+        raise Unsupported("the size of an integer")
+    return Dual(on.built_in("fabs", a.value), on.times(_sign(on, a.value), a.slope) if a.slope is not None else None)
+
+
+def _chosen(on: Arithmetic, p: Any, which: Dual, *cases: Dual) -> Dual:
+    if len(cases) != 2 or which.value.type != _BIT:
+        raise Unsupported("a choice among more than two")
+    no, yes = cases
+    slope = None
+    if no.slope is not None or yes.slope is not None:
+        slope = on.chosen(which.value, on.slope(yes), on.slope(no))
+    return Dual(on.chosen(which.value, yes.value, no.value), slope)
+
+
+def _converted(on: Arithmetic, p: Any, a: Dual) -> Dual:
+    build, new, old = on.builder, type_of(p["new_dtype"]), a.value.type
+    if new == old or isinstance(old, ir.VectorType):
+        return a
+    if DOUBLE not in (new, old):
+        if new == _BIT:
+            return Dual(build.icmp_signed("!=", a.value, ir.Constant(old, 0)))
+        widened = build.zext if old == _BIT else build.sext
+        return Dual(build.trunc(a.value, new) if new.width < old.width else widened(a.value, new))
+    if new == DOUBLE:
+        return Dual((build.uitofp if old == _BIT else build.sitofp)(a.value, new))
+    zero = on.number(0.0)
+    return Dual(build.fcmp_unordered("!=", a.value, zero) if new == _BIT else build.fptosi(a.value, new))
+
+
+def _negative(on: Arithmetic, p: Any, a: Dual) -> Dual:
+    if not _is_real(a):
+        return Dual(on.builder.neg(a.value))
+    return Dual(on.builder.fneg(a.value), None if a.slope is None else on.builder.fneg(a.slope))
+
+
+def _finite(on: Arithmetic, p: Any, a: Dual) -> Dual:
+    return Dual(on.builder.fcmp_ordered("<", on.built_in("fabs", a.value), on.number(math.inf)))
+
+
+def _smooth(name: str, rate: Callable[[Arithmetic, ir.Value, ir.Value], ir.Value], built_in: bool = False) -> _Rule:
+    """A function of one number, and its derivative by the number and by what it comes to."""
+
+    def rule(on: Arithmetic, p: Any, a: Dual) -> Dual:
+        value = on.built_in(name, a.value) if built_in else on.called(name, a.value)
+        return Dual(value, None if a.slope is None else on.times(rate(on, a.value, value), a.slope))
+
+    return rule
+
+
+def _over_root(sign: float, square: float) -> Callable[[Arithmetic, ir.Value, ir.Value], ir.Value]:
+    """1 / sqrt(sign + square x^2), the derivative of inverse functions."""
+
+    def rate(on: Arithmetic, x: ir.Value, value: ir.Value) -> ir.Value:
+        inside = on.plus(on.number(sign), on.times(on.number(square), on.times(x, x)))
+        return on.over(on.number(1.0), on.built_in("sqrt", inside))
+
+    return rate
+
+
+def _over_square(square: float) -> Callable[[Arithmetic, ir.Value, ir.Value], ir.Value]:
+    """1 / (1 + square x^2)."""
+    return lambda on, x, value: on.over(
+        on.number(1.0), on.plus(on.number(1.0), on.times(on.number(square), on.times(x, x)))
+    )
+
+
+def _one_and(square: float) -> Callable[[Arithmetic, ir.Value, ir.Value], ir.Value]:
+    """1 + square f^2, of what a function comes to."""
+    return lambda on, x, value: on.plus(on.number(1.0), on.times(on.number(square), on.times(value, value)))
+
+
+def _bits(name: str) -> _Rule:
+    return lambda on, p, a, b: Dual(getattr(on.builder, name)(a.value, b.value))
+
+
+RULES: dict[str, _Rule] = {
+    "abs": _size,
+    "acos": _smooth("acos", lambda on, x, f: on.builder.fneg(_over_root(1.0, -1.0)(on, x, f))),
+    "acosh": _smooth("acosh", _over_root(-1.0, 1.0)),
+    "add": _linear("plus", "add"),
+    "add_any": _linear("plus", "add"),
+    "and": _bits("and_"),
+    "asin": _smooth("asin", _over_root(1.0, -1.0)),
+    "asinh": _smooth("asinh", _over_root(1.0, 1.0)),
+    "atan": _smooth("atan", _over_square(1.0)),
+    "atan2": _direction,
+    "atanh": _smooth("atanh", _over_square(-1.0)),
+    "clamp": _bounded,
+    "convert_element_type": _converted,
+    "copy": lambda on, p, a: a,
+    "cos": _smooth("cos", lambda on, x, f: on.builder.fneg(on.called("sin", x))),
+    "cosh": _smooth("cosh", lambda on, x, f: on.called("sinh", x)),
+    "div": _quotient,
+    "eq": _compared("=="),
+    "exp": _smooth("exp", lambda on, x, f: f),
+    "ge": _compared(">="),
+    "gt": _compared(">"),
+    "integer_pow": _integer_power,
+    "is_finite": _finite,
+    "le": _compared("<="),
+    "log": _smooth("log", lambda on, x, f: on.over(on.number(1.0), x)),
+    "lt": _compared("<"),
+    "max": _larger(">"),
+    "min": _larger("<"),
+    "mul": _product,
+    "ne": _compared("!="),
+    "neg": _negative,
+    "not": lambda on, p, a: Dual(on.builder.not_(a.value)),
+    "or": _bits("or_"),
+    "pow": _power,
+    "select_n": _chosen,
+    "sign": lambda on, p, a: Dual(_sign(on, a.value)),
+    "sin": _smooth("sin", lambda on, x, f: on.called("cos", x)),
+    "sinh": _smooth("sinh", lambda on, x, f: on.called("cosh", x)),
+    "sqrt": _smooth("sqrt", lambda on, x, f: on.over(on.number(0.5), f), built_in=True),
+    "square": lambda on, p, a: _integer_power(on, {"y": 2}, a),
+    "sub": _linear("minus", "sub"),
+    "tan": _smooth("tan", _one_and(1.0)),
+    "tanh": _smooth("tanh", _one_and(-1.0)),
+}
+# Operations on places, which are worked out where these are known: to pick entries, one must know which.
+_PLAIN: dict[str, Callable[..., Any]] = {
+    "add": lambda a, b, like: like(a + b).item(),
+    "convert_element_type": lambda a, like: like(a).item(),
+    "lt": lambda a, b, like: bool(a < b),
+    "select_n": lambda which, *cases, like: cases[int(which)],
+}
