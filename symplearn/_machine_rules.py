@@ -87,7 +87,7 @@ class Arithmetic:
         return a, b
 
     def number(self, value: float) -> ir.Constant:
-        return ir.Constant(DOUBLE, float(value))
+        return ir.Constant(DOUBLE, value)
 
     def plus(self, a: Any, b: Any) -> Any:
         """A sum; None is nothing."""
@@ -211,7 +211,7 @@ def _integer_power(on: Arithmetic, p: Any, a: Dual) -> Dual:
     y = p["y"]
     if not _is_real(a) or y == 0:
         raise Unsupported("a power of an integer, or of none")
-    rate = None if a.slope is None else on.times(on.number(y), on.power(a.value, y - 1))
+    rate = None if a.slope is None else on.times(on.number(float(y)), on.power(a.value, y - 1))
     return Dual(on.power(a.value, y), on.times(rate, a.slope))
 
 

@@ -41,7 +41,7 @@ class Found:
     """
 
     shown: Float[np.ndarray, "lane time shown"]
-    slopes: Sequence[Float[np.ndarray, "direction time shown"]]
+    slopes: Sequence[Float[np.ndarray, "_ time shown"]]
 
 
 class AbstractSteps(abc.ABC):
