@@ -114,11 +114,14 @@ class Arithmetic:
         return self.builder.select(which, *self.pair(yes, no))
 
     def called(self, name: str, *values: ir.Value) -> ir.Value:
-        """A function of the C library."""
-        kind = ir.FunctionType(DOUBLE, [DOUBLE] * len(values))
-        return self.builder.call(
-            self.builder.module.globals.get(name) or ir.Function(self.builder.module, kind, name), values
-        )
+        """A function of the C library; its error number is not looked at, so that equal calls are one."""
+        kind, module = ir.FunctionType(DOUBLE, [DOUBLE] * len(values)), self.builder.module
+        function = module.globals.get(name)
+        if function is None:
+            function = ir.Function(module, kind, name)
+            for attribute in ("nounwind", "readnone"):
+                function.attributes.add(attribute)
+        return self.builder.call(function, values)
 
     def built_in(self, name: str, *values: ir.Value) -> ir.Value:
         """A function that LLVM knows."""
