@@ -19,6 +19,7 @@ import integrators as ig
 from .._augmented import Equations
 from .._augmented_flow import SimulatedFlow, SimulatedReading, Span
 from .._augmented_system import Switches
+from .._machine_rules import Unsupported
 from ._course import Course
 from ._row_loop import MANY, POINTERS, row_loop
 from ._row_loop import WIDTH as WIDTH
@@ -45,15 +46,24 @@ class Rail:
         times, inputs, starts, steps, means = (np.ascontiguousarray(leaf, float) for leaf in reals)
         return cls(times, inputs, starts, steps, np.ascontiguousarray(spans.pieces, np.int64), means)
 
+    def since(self, row: int) -> "Rail":
+        """The same from a row on."""
+        return Rail(*(array[row:] for array in self.arrays))
+
     @property
     def arrays(self) -> tuple[np.ndarray, ...]:
         return self.times, self.inputs, self.starts, self.steps, self.pieces, self.means
 
 
 @lru_cache(maxsize=4)
-def native_rows(equations: Equations, integrator: ig.AbstractIntegrator, inputs: int) -> "NativeRows":
-    """The machine code of a simulation, written once; `Unsupported` where there is none."""
-    return NativeRows(equations, integrator, inputs)
+def native_rows(equations: Equations, integrator: ig.AbstractIntegrator, inputs: int) -> "NativeRows | None":
+    """The machine code of a simulation, written once; None where there is none, or the work is not a processor's."""
+    if jax.default_backend() != "cpu":
+        return None
+    try:
+        return NativeRows(equations, integrator, inputs)
+    except Unsupported:
+        return None
 
 
 class NativeRows:

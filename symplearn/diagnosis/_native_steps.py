@@ -47,6 +47,22 @@ class NativeSteps(AbstractSteps):
         return out, along[: len(places)]
 
 
+def run_natively(
+    native: NativeRows, problem: Problem, course: Course, recording: int, unknowns: Float[np.ndarray, " unknown"],
+    coefficients: Float[np.ndarray, " coefficient"], start: int,
+) -> Float[np.ndarray, "time shown"]:  # fmt: skip
+    """Readings and phase points from row `start` on, where a run begins whose phase point and calibrated values are
+    the `unknowns`; `coefficients` are added to those already there."""
+    known, links = _link(course, native.state)
+    values = known + unknowns @ links
+    values[known.size - coefficients.size :] += coefficients
+    rows = len(problem.rows[recording].times) - start
+    out, along = np.empty((rows, native.shown)), np.empty((WIDTH, rows, native.shown))
+    switches = needed(problem, recording, coefficients[None, None])
+    native(values, np.zeros((known.size, WIDTH)), Rail.of(course).since(start), switches, None, out, along)
+    return out
+
+
 def _link(course: Course, state: int) -> tuple[Float[np.ndarray, " taken"], Float[np.ndarray, "known taken"]]:
     """What the machine takes where all unknowns are zero, and what each unknown but the slots adds to it."""
     parameters, terms, to_parameters, to_coefficients = map(

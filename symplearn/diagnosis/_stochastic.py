@@ -17,6 +17,8 @@ from .._model import Gaussian, StateSpaceModel
 from .._smoother import Smoothed, smooth_along
 from ._calibrate import THINNED
 from ._course import Course, model_at
+from ._native_rows import native_rows
+from ._native_steps import run_natively
 from ._path import Linear, linearise
 from ._problem import SLOTS, Combination, Problem
 from ._trajectory import Stepper
@@ -190,6 +192,10 @@ def free_run(
     """Readings and phase points from row `start` on of a run that begins at `x` there and looks at no reading."""
     coefficients = problem.coefficients(recording, z, combination) - problem.coefficients(recording, z, ())
     head, f = problem.head, problem.calibrated.size
+    native = native_rows(problem.equations, problem.integrator, course.inputs.shape[1])
+    if native is not None:
+        shown = run_natively(native, problem, course, recording, np.append(x, z[head : head + f]), coefficients, start)
+        return shown[:, : problem.channels], shown[:, problem.channels :]
     readings, states = run_lane(
         problem.equations,
         problem.integrator,

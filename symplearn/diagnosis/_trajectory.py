@@ -4,11 +4,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._machine_code import Unsupported
 from ._batched_steps import LANES as LANES
 from ._batched_steps import BatchedSteps
 from ._course import Course, costly, courses
@@ -33,13 +31,9 @@ class Predictions:
 
 def _steps(problem: Problem, threads: Threads) -> AbstractSteps:
     """How a problem is stepped: by machine code, where there is one for it and the work is a processor's."""
-    along, p = courses(problem), problem
-    if jax.default_backend() == "cpu":
-        try:
-            return NativeSteps(native_rows(p.equations, p.integrator, along[0].inputs.shape[1]), along, threads)
-        except Unsupported:
-            pass
-    return BatchedSteps(along, threads)
+    along = courses(problem)
+    native = native_rows(problem.equations, problem.integrator, along[0].inputs.shape[1])
+    return BatchedSteps(along, threads) if native is None else NativeSteps(native, along, threads)
 
 
 class Stepper:
