@@ -18,6 +18,7 @@ ROWS = (
     Row("growth_with_state", "cost along the size of the state (with --full to 402)"),
     Row("sampling", "posterior of Henon-Heiles to 400 effective draws, against corrected DRAM"),
     Row("sampling_cherry", "posterior of Cherry's 36 parameters to 400 effective draws, against corrected DRAM"),
+    Row("stepping", "trajectories with their slopes, as a diagnosis steps them, by machine code and by XLA"),
     Row("diagnosing", "`symplearn demo` cold and warm, processes of their own"),
     Row("answering", "Henon-Heiles from a recording to the most probable model, warm"),
     Row("whole_loops", "what the option of XLA that symplearn sets does for dynamax, and for symplearn", _DYNAMAX),

@@ -1,7 +1,6 @@
 """What every recording gives to its trajectories, and the model at given values: flow and observation."""
 
-from collections.abc import Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +14,7 @@ import integrators as ig
 from .._augmented import Equations
 from .._augmented_flow import SimulatedFlow, SimulatedReading, Span
 from .._augmented_system import EVERYTHING, Switches
-from .._effects import COULOMB, DELAY, FORCING, IMPULSE, MODULATION, REGIME, Effect
+from .._effects import COULOMB, DELAY, FORCING, IMPULSE, MODULATION, REGIME
 from ._problem import Combination, Problem
 
 # Effects whose work is left out where no lane has one of them, by the switch that they share.
@@ -92,11 +91,17 @@ def needed(
     problem: Problem, recording: int, hots: Float[np.ndarray, "lane row coefficient"]
 ) -> Bool[np.ndarray, " switch"]:
     """Which switches lanes that are stepped together need, for what they have or what is known."""
-    eq, c = problem.equations, problem.calibrated
     on = (problem.terms[recording] != 0) | (hots != 0).any((0, 1))
-    on[c.place[c.parameters :]] = True
+    on[problem.calibrated.place[problem.calibrated.parameters :]] = True
+    own, always = _touched(problem.equations)
+    return (own & on).any(1) | always
 
-    def has(effects: Sequence[Effect]) -> bool:
-        return any(bool(on[eq.firsts(effect)].any()) for effect in effects) or (IMPULSE in effects and bool(eq.jumping))
 
-    return np.array([has(effects) for effects in _SWITCHED])
+@lru_cache(maxsize=8)
+def _touched(equations: Equations) -> tuple[Bool[np.ndarray, "switch coefficient"], Bool[np.ndarray, " switch"]]:
+    """The first coefficient of every effect of a switch, and whether it is on whatever they are."""
+    own = np.zeros((len(_SWITCHED), equations.size), bool)
+    for k, effects in enumerate(_SWITCHED):
+        for effect in effects:
+            own[k, equations.firsts(effect)] = True
+    return own, np.array([IMPULSE in effects and bool(equations.jumping) for effects in _SWITCHED])

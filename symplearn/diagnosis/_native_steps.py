@@ -32,12 +32,13 @@ class NativeSteps(AbstractSteps):
         """Readings and phase points of one lane, and their slopes."""
         r, z, hot, places = run.recording, run.z[lane], run.hots[lane], run.along[lane]
         known, links = self.links[r]
-        table = np.concatenate([links, np.pad(hot[:-1], [(0, 0), (known.size - hot.shape[1], 0)])])
-        values = known + z @ table
-        values[known.size - hot.shape[1] :] += hot[-1]
-        blocks = -(-max(1, len(places)) // WIDTH)
+        number, first = len(links), known.size - hot.shape[1]
+        values = known + z[:number] @ links
+        values[first:] += z[number:] @ hot[:-1] + hot[-1]
+        blocks, is_slot = -(-max(1, len(places)) // WIDTH), places >= number
         free = np.zeros((blocks * WIDTH, known.size))
-        free[: len(places)] = table[places]
+        free[: len(places)][~is_slot] = links[places[~is_slot]]
+        free[: len(places), first:][is_slot] = hot[places[is_slot] - number]
         slopes = np.ascontiguousarray(free.reshape(blocks, WIDTH, -1).transpose(0, 2, 1))
         path = None if run.paths is None else np.ascontiguousarray(run.paths[lane])
         out, along = np.empty((run.rows, self.native.shown)), np.empty((blocks * WIDTH, run.rows, self.native.shown))
