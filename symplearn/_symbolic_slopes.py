@@ -13,7 +13,11 @@ import sympy
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
+from ._derivative import bottom_up
 from ._symbolic import TooLarge, derivative, jax_function
+
+# Nodes times symbols: of more, SymPy differentiates longer (a second) than the slopes save.
+_WORTH = 20_000
 
 
 def with_slopes(
@@ -22,6 +26,8 @@ def with_slopes(
     """`jax_function`, differentiated by its expressions' own derivatives; by JAX where these are too large."""
     plain, trees = jax_function(expressions, symbols), list(map(sympy.sympify, expressions))
     used = [(k, one) for k, one in enumerate(symbols) if any(one in e.free_symbols for e in trees)]
+    if len(bottom_up(trees)) * len(used) > _WORTH:
+        return plain
     try:
         table = [[(k, derivative(e, one)) for k, (_, one) in enumerate(used) if one in e.free_symbols] for e in trees]
     except TooLarge:

@@ -9,6 +9,7 @@ import sympy
 from symplearn._expression import parse_expression, symbol
 from symplearn._separable import is_separable
 from symplearn._symbolic import TooLarge, derivative, gradient, jax_function, numpy_function
+from symplearn._symbolic_slopes import with_slopes
 
 NAMES = ("x", "y", "p")
 SYMBOLS = tuple(map(symbol, NAMES))
@@ -39,6 +40,27 @@ def test_the_symbolic_gradient_is_jaxs(text):
     automatic = jax.grad(lambda v: jax_function([expr], SYMBOLS)(v)[0])(POINT)
     symbolic = jax_function(gradient(expr, SYMBOLS), SYMBOLS)(POINT)
     np.testing.assert_allclose(symbolic, automatic, rtol=1e-13, atol=1e-14)  # a few roundings
+
+
+def test_slopes_that_are_trees_are_those_of_the_function():
+    """Worked out beforehand, in forward and in reverse mode, of one point and of many, slopes are JAX's own."""
+    expressions = [parsed(text) for text in SMOOTH]
+    plain, ours = jax_function(expressions, SYMBOLS), with_slopes(expressions, SYMBOLS)
+    np.testing.assert_array_equal(ours(POINT), plain(POINT))
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(mode(ours)(POINT), mode(plain)(POINT), rtol=1e-13, atol=1e-14)  # a few roundings
+    many = POINT[:, None] * jnp.array([1.0, 0.9])
+    np.testing.assert_allclose(jax.jvp(ours, (many,), (many,))[1], jax.jvp(plain, (many,), (many,))[1], rtol=1e-13)
+    twice = jax.jacfwd(jax.jacfwd(ours))(POINT), jax.jacfwd(jax.jacfwd(plain))(POINT)
+    np.testing.assert_allclose(*twice, rtol=1e-12, atol=1e-13)  # a few more
+    assert "custom_jvp_call" in str(jax.make_jaxpr(ours)(POINT))
+
+
+def test_large_trees_are_left_to_jax():
+    """What SymPy would differentiate too long is differentiated by JAX, to the same slopes."""
+    large = sympy.Add(*(sympy.sin(k * SYMBOLS[0]) * sympy.cos(k * SYMBOLS[1]) for k in range(1, 3000)))
+    function = with_slopes([large], SYMBOLS)
+    assert "custom_jvp_call" not in str(jax.make_jaxpr(function)(POINT))
 
 
 @pytest.mark.parametrize("text", SMOOTH)
