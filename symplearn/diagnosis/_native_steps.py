@@ -40,7 +40,7 @@ class NativeSteps(AbstractSteps):
         free[: len(places)][~is_slot] = links[places[~is_slot]]
         free[: len(places), first:][is_slot] = hot[places[is_slot] - number]
         slopes = np.ascontiguousarray(free.reshape(blocks, WIDTH, -1).transpose(0, 2, 1))
-        path = None if run.paths is None else np.ascontiguousarray(run.paths[lane])
+        path = None if run.paths is None else np.ascontiguousarray(run.paths[lane], float)
         out, along = np.empty((run.rows, self.native.shown)), np.empty((blocks * WIDTH, run.rows, self.native.shown))
         switches = needed(problem, r, hot[None])
         for k, block in enumerate(slopes):

@@ -72,7 +72,7 @@ class _Rows:
         now = arrived.load()
         begun.store(now)
         self.on_the_path(k, x, begun)
-        given = [*begun.load(), *numbers, *self.given(k), *(_array([bit])[0:1].reshape(()) for bit in self.on)]
+        given = [*begun.load(), *numbers, *self.given(k), *(_array([bit]).reshape(()) for bit in self.on)]
         seen, after = self.code.evaluated(self.program, given)
         self.told(k, [*seen, *now[0]])
         arrived.store([after])
