@@ -1,6 +1,7 @@
 """Trajectories with their sensitivities by machine code, lane by lane."""
 
 from collections.abc import Sequence
+from itertools import chain, islice
 
 import numpy as np
 from jaxtyping import Float
@@ -9,6 +10,9 @@ from ._course import Course, needed
 from ._lanes import AbstractSteps, Found, Lanes, Threads
 from ._native_rows import WIDTH, NativeRows, Rail
 from ._problem import Problem
+
+# Substeps, each with the slopes of one register, that take as long as some ten tasks of a thread: two milliseconds.
+_WORTH = 4000
 
 
 class NativeSteps(AbstractSteps):
@@ -21,12 +25,19 @@ class NativeSteps(AbstractSteps):
 
     def __call__(self, problem: Problem, runs: Sequence[Lanes]) -> list[Found]:
         work = [(problem, run, lane) for run in runs for lane in range(len(run.z))]
-        done = self.threads.each(lambda one: self._lane(*one), work)
-        out = []
+        shares = np.array_split(np.arange(len(work)), self._threads(runs))
+        parts = self.threads.each(lambda some: [self._lane(*work[k]) for k in some], shares)
+        done, out = chain.from_iterable(parts), []
         for run in runs:
-            shown, slopes = zip(*(next(done) for _ in range(len(run.z))), strict=True)
+            shown, slopes = zip(*islice(done, len(run.z)), strict=True)
             out.append(Found(np.stack(shown), slopes))
         return out
+
+    def _threads(self, runs: Sequence[Lanes]) -> int:
+        """On how many threads runs are worth their handing over."""
+        substeps = [int(self.rails[run.recording].pieces[: run.rows].sum()) for run in runs]
+        blocks = [sum(-(-len(places) // WIDTH) for places in run.along) for run in runs]
+        return self.threads.jobs if np.dot(substeps, blocks) > _WORTH else 1
 
     def _lane(self, problem: Problem, run: Lanes, lane: int) -> tuple[np.ndarray, np.ndarray]:
         """Readings and phase points of one lane, and their slopes."""
