@@ -156,11 +156,8 @@ class Simulated(eqx.Module):
     def at(
         self, t: Float[Array, ""] | float, inputs: Float[Array, " input"], width: Float[Array, ""] | float = 1e-9
     ) -> SimulatedHamiltonian:
-        """The system at one time; `width` as in `moment`."""
-        return self.frozen(self.moment(jnp.asarray(t, self.coefficients.dtype), width), inputs)
-
-    def frozen(self, moment: Moment, inputs: Float[Array, " input"]) -> SimulatedHamiltonian:
-        """The system with everything that depends on time as it stands at a moment."""
+        """The system with all that depends on time as it stands at one time; `width` as in `moment`."""
+        moment = self.moment(jnp.asarray(t, self.coefficients.dtype), width)
         return SimulatedHamiltonian(self.equations, self.coefficients, self.values, inputs, moment)
 
     def moment(self, t: Float[Array, ""], width: Float[Array, ""] | float) -> Moment:

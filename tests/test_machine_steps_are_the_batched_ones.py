@@ -99,6 +99,7 @@ def test_rows_may_begin_anew(steppers):
     along = [np.arange(problem.state), np.arange(3, 14), np.array([0])]
     runs = [Lanes(1, local, hots, along, 9, paths)]
     (mine,), (theirs,) = native.steps(problem, runs), batched.steps(problem, runs)
+    # Round-off of the substeps of one row.
     assert compared(mine.shown, theirs.shown) < 1e-10
     for one, other, places in zip(mine.slopes, theirs.slopes, along, strict=True):
         assert one.shape == (len(places), 9, problem.channels + problem.state)
@@ -114,6 +115,7 @@ def test_a_free_run_is_the_same_from_any_row(steppers, monkeypatch):
     monkeypatch.setattr(_stochastic, "native_rows", lambda *some: None)
     for one, other in zip(mine, free_run(*given), strict=True):
         assert one.shape == other.shape and len(one) == len(problem.rows[0].times) - 4
+        # Round-off of a hundred substeps.
         assert compared(one, other) < 1e-10
 
 

@@ -47,6 +47,7 @@ def test_slopes_that_are_trees_are_those_of_the_function():
     expressions = [parsed(text) for text in SMOOTH]
     plain, ours = jax_function(expressions, SYMBOLS), with_slopes(expressions, SYMBOLS)
     np.testing.assert_array_equal(ours(POINT), plain(POINT))
+    # The same products in another order; entries are about one, and those that cancel are left with their round-off.
     for mode in (jax.jacfwd, jax.jacrev):
         np.testing.assert_allclose(mode(ours)(POINT), mode(plain)(POINT), rtol=1e-13, atol=1e-14)  # a few roundings
     many = POINT[:, None] * jnp.array([1.0, 0.9])

@@ -1,9 +1,10 @@
 """Trajectories with their sensitivities as machine code: one function for all rows of a recording."""
 
 import ctypes
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import jax
@@ -54,6 +55,12 @@ class Rail:
     def arrays(self) -> tuple[np.ndarray, ...]:
         return self.times, self.inputs, self.starts, self.steps, self.pieces, self.means
 
+    @cached_property
+    def places(self) -> list[int]:
+        """Where the arrays lie in memory."""
+        assert all(array.flags.c_contiguous for array in self.arrays), "the machine reads what lies end to end"
+        return [array.ctypes.data for array in self.arrays]
+
 
 @lru_cache(maxsize=4)
 def native_rows(equations: Equations, integrator: ig.AbstractIntegrator, inputs: int) -> "NativeRows | None":
@@ -87,12 +94,14 @@ class NativeRows:
 
         Phase points stand beside the readings; with a `path` they are those that arrive from its row before.
         """
-        arrays = values, slopes, *rail.arrays, switches, *(() if path is None else (path,)), out, along
+        arrays = values, slopes, switches, *(() if path is None else (path,)), out, along
         assert all(array.flags.c_contiguous for array in arrays), "the machine reads what lies end to end"
-        first = [array.ctypes.data for array in (values, slopes, *rail.arrays, switches)]
-        stride = int(np.prod(rail.means.shape[1:]))
+        at, stride = (
+            [array.ctypes.data for array in (values, slopes, switches, out, along)],
+            math.prod(rail.means.shape[1:]),
+        )
         begun = None if path is None else path.ctypes.data
-        self._run(len(out), stride, *first, begun, out.ctypes.data, along.ctypes.data)
+        self._run(len(out), stride, *at[:2], *rail.places, at[2], begun, *at[3:])
 
 
 def _traced(equations: Equations, integrator: ig.AbstractIntegrator, sizes: Sequence[int], inputs: int) -> ClosedJaxpr:
