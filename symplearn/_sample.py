@@ -17,9 +17,11 @@ from ._importance import AdaptiveImportance
 from ._parameters import flatten
 from ._posterior import Posterior, log_posterior_of, posterior_of
 from ._sampler import AbstractBlockSampler, AbstractSampler, Drawn, LogDensity
+from ._small_arrays import on_one_thread
 from ._whitening import Whitening, standard, whiten
 
 
+@on_one_thread
 def sample(
     estimate: Estimate,
     *,
@@ -59,6 +61,7 @@ def sample(
     return posterior_of(estimate, drawn, str(sampler))
 
 
+@on_one_thread
 def sample_density(
     log_density: LogDensity,
     start: Any,

@@ -7,6 +7,7 @@ import numpy as np
 
 from .._recording import Recording
 from .._simulation_records import SimulationFile
+from .._small_arrays import on_one_thread
 from ._answer import Answer
 from ._find import searched
 from ._forecast import forecast_times
@@ -16,6 +17,7 @@ from ._record import Diagnosis
 _AS_USUAL = Options()
 
 
+@on_one_thread
 def diagnose(file: SimulationFile, recordings: Sequence[Recording], options: Options = _AS_USUAL) -> Diagnosis:
     """Locate what differs between a simulation and its recordings, name what was left out, and show the fit without
     and with it.
