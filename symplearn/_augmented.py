@@ -50,12 +50,12 @@ class Equations:
     readings: Callable[[Array], Array]  # what the columns show without errors of their sensors
     impulses: Callable[[Array], Array]  # size and time of every known impulse, end to end
 
-    @property
+    @cached_property
     def dim(self) -> int:
         """Degrees of freedom that the simulation knows."""
         return len(self.coordinates)
 
-    @property
+    @cached_property
     def width(self) -> int:
         """Degrees of freedom of a phase point."""
         return self.dim + self.hidden

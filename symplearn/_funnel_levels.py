@@ -13,6 +13,7 @@ from scipy.special import logsumexp, ndtri
 from scipy.stats import qmc
 
 from ._importance import kish, softened
+from ._lane_loops import with_lane_loops
 from ._log_posterior import gradient
 from ._noise import AdditiveGaussian
 from ._parameters import flatten, resolve
@@ -149,9 +150,10 @@ class Walk:
         return np.concatenate([[0.0], grown[1:]])
 
     def _values(self, places: np.ndarray) -> np.ndarray:
-        """The log posterior at some places, -inf where it is not a number; in chunks of one size, compiled once."""
-        size = -(-len(places) // TOGETHER) * TOGETHER
-        chunks = np.resize(places, (size, places.shape[1])).reshape(-1, TOGETHER, places.shape[1])
+        """The log posterior at some places, -inf where it is not a number; in chunks of two sizes, compiled once."""
+        each = TOGETHER if len(places) <= TOGETHER else _DRAWS
+        size = -(-len(places) // each) * each
+        chunks = np.resize(places, (size, places.shape[1])).reshape(-1, each, places.shape[1])
         found = np.concatenate([_values(self.density, self.axes, jnp.asarray(one)) for one in chunks])[: len(places)]
         return np.where(np.isfinite(found), found, -np.inf)
 
@@ -201,7 +203,7 @@ def _log_noise(density, axes, places):
 
 @eqx.filter_jit
 def _values(density, axes, places):
-    return jax.vmap(lambda place: density(axes @ place))(places)
+    return jax.vmap(with_lane_loops(lambda place: density(axes @ place)))(places)
 
 
 @eqx.filter_jit

@@ -246,10 +246,15 @@ def softened(log_weights: np.ndarray, least: float) -> np.ndarray:
     if kish(log_weights) >= least:
         low = 1.0
     finite = np.isfinite(log_weights)
-    logs = log_weights[finite]
+    logs = log_weights[finite] - np.max(log_weights)
+
+    def effective(power: float) -> float:
+        some = np.exp(power * logs)
+        return float(some.sum() ** 2 / (some @ some))
+
     while high - low > 1e-6:
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if kish(middle * logs) >= least else (low, middle)
+        low, high = (middle, high) if effective(middle) >= least else (low, middle)
     weights = np.zeros(len(log_weights))
     weights[finite] = softmax(low * logs)
     return weights

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._faults import IMPOSSIBLE
+from ._lane_loops import with_lane_loops
 from ._model import AbstractStateSpaceModel
 from ._objectives import AbstractObjective, TimeSeries
 from ._prior import Prior
@@ -51,7 +52,7 @@ def _value_and_gradient(score: Callable[[Array], Array], size: int) -> Callable[
                 raise
             return forward(free)
 
-    return forward if size <= _FORWARD else reverse
+    return with_lane_loops(forward if size <= _FORWARD else reverse)
 
 
 def guarded(score: Callable[[Array], Array], size: int) -> Callable[[Array], Array]:
@@ -60,7 +61,7 @@ def guarded(score: Callable[[Array], Array], size: int) -> Callable[[Array], Arr
 
     @jax.custom_vjp
     def safe(free):
-        value = score(free)
+        value = with_lane_loops(score)(free)
         return jnp.where(jnp.isfinite(value), value, HOPELESS)
 
     def forward(free):

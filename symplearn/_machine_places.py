@@ -1,5 +1,6 @@
 """Operations that move or join the entries of small arrays, which the machine code holds one by one."""
 
+import math
 from collections.abc import Callable
 from functools import reduce
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from ._machine_rules import RULES, Arithmetic, Unsupported, known
+from ._machine_rules import RULES, Arithmetic, Dual, Unsupported, known
 
 _Place = Callable[[Arithmetic, JaxprEqn, list[np.ndarray]], list[np.ndarray]]
 
@@ -28,23 +29,29 @@ def _cut(array: np.ndarray, p: Any) -> np.ndarray:
 
 
 def _padded(on: Arithmetic, one: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
-    (array, filling), ends = values, one.params["padding_config"]
-    if any(low < 0 or high < 0 or inner for low, high, inner in ends):
-        raise Unsupported("an array that is cut at its ends, or filled between")
-    out = np.empty([n + low + high for n, (low, high, _) in zip(array.shape, ends, strict=True)], object)
-    out[...] = filling[()]
-    out[tuple(slice(low, low + n) for n, (low, _, _) in zip(array.shape, ends, strict=True))] = array
-    return [out]
+    """Filled up at its ends and between, or cut at its ends."""
+    array, filling = values
+    for axis, (low, high, inner) in enumerate(one.params["padding_config"]):
+        rows = np.moveaxis(array, axis, 0)
+        size = low + high + len(rows) + inner * max(len(rows) - 1, 0)
+        out = np.empty((size, *rows.shape[1:]), object)
+        out[...] = filling[()]
+        for k, row in enumerate(rows):
+            if 0 <= (at := low + k * (inner + 1)) < size:
+                out[at] = row
+        array = np.moveaxis(out, 0, axis)
+    return [array]
 
 
 def _picked(on: Arithmetic, one: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
-    """Entries of a vector at places that are known."""
-    vector, places = values
-    plain = vector.ndim == 1 and one.params["slice_sizes"] == (1,) and not one.params["dimension_numbers"].offset_dims
-    found = [known(place) for place in places.ravel()]
+    """Single entries at places that are known."""
+    (array, places), p = values, one.params
+    axes, found = p["dimension_numbers"].start_index_map, [known(place) for place in places.ravel()]
+    plain = set(p["slice_sizes"]) == {1} and not p["dimension_numbers"].offset_dims and len(axes) == array.ndim
     if not plain or None in found:
         raise Unsupported("entries at places that are not known")
-    return [vector[np.array(found, int).reshape(places.shape[:-1])]]
+    where = np.moveaxis(np.array(found, int).reshape(places.shape), -1, 0)
+    return [array[tuple(where[axes.index(axis)] for axis in range(array.ndim))]]
 
 
 def _counted(on: Any, one: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
@@ -67,20 +74,55 @@ def _reduced(name: str) -> _Place:
     return rule
 
 
+def _contracted(on: Arithmetic, one: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
+    """Sums of products of two arrays over some axes, row by row of those that they share."""
+    (along, other_along), (shared, other_shared) = one.params["dimension_numbers"]
+    left, right = (_matrices(*some) for some in zip(values, (along, other_along), (shared, other_shared), strict=True))
+    out = [_product(on, one, [a, b.T])[0] for a, b in zip(left[0], right[0], strict=True)]
+    return [np.stack(out).reshape((*left[1], *left[2], *right[2]))]
+
+
+def _matrices(array: np.ndarray, along: Any, shared: Any) -> tuple[np.ndarray, list[int], list[int]]:
+    """An array as matrices whose columns are the axes `along`, one for each row of the `shared` axes; the sizes of
+    these and of the others."""
+    rest = [k for k in range(array.ndim) if k not in along and k not in shared]
+    sizes = [[array.shape[k] for k in axes] for axes in (shared, rest, along)]
+    turned = array.transpose(*shared, *rest, *along)
+    return turned.reshape([math.prod(some) for some in sizes]), sizes[0], sizes[1]
+
+
+def _product(on: Arithmetic, one: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
+    """A product of two matrices, or of two stacks of them. Terms that are known to be zero are left out."""
+    left, right = values
+    if left.ndim > 2:
+        return [np.stack([_product(on, one, list(pair))[0] for pair in zip(left, right, strict=True)])]
+    out = np.empty((len(left), right.shape[1]), object)
+    for i, j in np.ndindex(out.shape):
+        pairs = [pair for pair in zip(left[i], right[:, j], strict=True) if 0.0 not in map(known, pair)]
+        terms = [RULES["mul"](on, {}, *pair) for pair in pairs]
+        out[i, j] = reduce(lambda a, b: RULES["add"](on, {}, a, b), terms) if terms else Dual(on.number(0.0))
+    return [out]
+
+
 PLACED: dict[str, _Place] = {
     "broadcast_in_dim": _spread,
+    "dot_general": _contracted,
     "concatenate": lambda on, one, values: [np.concatenate(values, one.params["dimension"])],
     "gather": _picked,
     "iota": _counted,
     "pad": _padded,
+    "reduce_and": _reduced("and"),
     "reduce_max": _reduced("max"),
     "reduce_min": _reduced("min"),
+    "reduce_or": _reduced("or"),
     "reduce_sum": _reduced("add"),
     "reshape": _moved(lambda array, p: array.reshape(p["new_sizes"])),
     "rev": _moved(lambda array, p: np.flip(array, p["dimensions"])),
     "slice": _moved(_cut),
+    "small_product": _product,
     "split": lambda on, one, values: np.split(values[0], np.cumsum(one.params["sizes"])[:-1], one.params["axis"]),
     "squeeze": _moved(lambda array, p: np.squeeze(array, p["dimensions"])),
     "stack": lambda on, one, values: [np.stack(values, one.params["axis"])],
+    "unstack": lambda on, one, values: list(np.moveaxis(values[0], one.params["axis"], 0)),
     "transpose": _moved(lambda array, p: np.transpose(array, p["permutation"])),
 }

@@ -1,6 +1,7 @@
 """How single numbers and their slopes along many directions are worked out, operation by operation."""
 
 import math
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -36,16 +37,22 @@ def type_of(dtype: Any) -> ir.Type:
     return _TYPES[str(dtype)]
 
 
+def kind_of(value: ir.Value) -> ir.Type:
+    """The type of a number, or of a register's entries."""
+    return value.type.element if isinstance(value.type, ir.VectorType) else value.type
+
+
 def known(dual: Dual) -> Any:
     """What a constant is; None for anything else."""
     return dual.value.constant if isinstance(dual.value, ir.Constant) else None
 
 
 class Arithmetic:
-    """Writes arithmetic of numbers and of registers."""
+    """Writes arithmetic of numbers and of registers; `Unsupported` beyond `most` operations of two of them."""
 
-    def __init__(self, builder: ir.IRBuilder, width: int):
-        self.builder, self.width, self.register = builder, width, ir.VectorType(DOUBLE, width)
+    def __init__(self, builder: ir.IRBuilder, width: int, most: int = sys.maxsize):
+        self.builder, self.width, self.most, self.written = builder, width, most, 0
+        self.register = self.register_of(DOUBLE)
 
     def ruled(self, one: JaxprEqn, entries: Sequence[Dual]) -> Dual:
         """What an operation makes of some numbers."""
@@ -58,6 +65,16 @@ class Arithmetic:
             return Dual(ir.Constant(kind, _PLAIN[name](*(known(e) for e in entries), like=np.dtype(shaped.dtype).type)))
         return RULES[name](self, one.params, *entries)
 
+    def spared(self, name: str, entries: Sequence[Dual]) -> Dual | None:
+        """What a product with zero, a sum with zero, or a product with one comes to without work; or None. What is no
+        number is lost in a product with zero."""
+        zeros, ones = ([k for k, entry in enumerate(entries) if known(entry) == value] for value in (0.0, 1.0))
+        if name == "mul" and zeros:
+            return entries[zeros[0]]
+        if (name in ("add", "add_any") and zeros) or (name == "mul" and ones):
+            return entries[1 - (zeros or ones)[0]]
+        return entries[0] if name in ("sub", "div") and 1 in (zeros if name == "sub" else ones) else None
+
     def _of_nothing(self, name: str, entries: Sequence[Dual]) -> Dual:
         """What an operation makes of slopes that are all zero: it is linear in them."""
         some = [entry for entry in entries if entry.value is not None]
@@ -67,13 +84,17 @@ class Arithmetic:
             return some[0]
         raise Unsupported(f"{name} of slopes")
 
+    def register_of(self, kind: ir.Type) -> ir.Type:
+        """The type of a register of some type of entries; a single one needs none."""
+        return kind if self.width == 1 else ir.VectorType(kind, self.width)
+
     def slope(self, dual: Dual) -> ir.Value:
         """The slopes of a number, zeros where there are none."""
         return ir.Constant(self.register, None) if dual.slope is None else self.wide(dual.slope)
 
     def wide(self, value: ir.Value) -> ir.Value:
         """A register with the same in every direction."""
-        if isinstance(value.type, ir.VectorType):
+        if self.width == 1 or isinstance(value.type, ir.VectorType):
             return value
         empty = ir.Constant(ir.VectorType(value.type, self.width), ir.Undefined)
         first = self.builder.insert_element(empty, value, ir.Constant(_SHORT, 0))
@@ -81,7 +102,10 @@ class Arithmetic:
         return self.builder.shuffle_vector(first, empty, places)
 
     def pair(self, a: ir.Value, b: ir.Value) -> tuple[ir.Value, ir.Value]:
-        """Two numbers, or two registers where one of them is."""
+        """Two numbers, or two registers where one of them is; they are about to become one."""
+        self.written += 1
+        if self.written > self.most:
+            raise Unsupported("a long function")
         if isinstance(a.type, ir.VectorType) or isinstance(b.type, ir.VectorType):
             return self.wide(a), self.wide(b)
         return a, b
@@ -111,11 +135,29 @@ class Arithmetic:
 
     def chosen(self, which: ir.Value, yes: ir.Value, no: ir.Value) -> ir.Value:
         """One of two, numbers or registers."""
+        if isinstance(which.type, ir.VectorType):
+            return self.builder.select(which, self.wide(yes), self.wide(no))
         return self.builder.select(which, *self.pair(yes, no))
 
+    def compared(self, sign: str, a: ir.Value, b: ir.Value) -> ir.Value:
+        """A comparison of real numbers, which what is no number fails; but it differs from all."""
+        compare = self.builder.fcmp_unordered if sign in ("!=", "ueq", "uno") else self.builder.fcmp_ordered
+        return compare(sign, *self.pair(a, b))
+
     def called(self, name: str, *values: ir.Value) -> ir.Value:
-        """A function of the C library; its error number is not looked at, so that equal calls are one."""
-        kind, module = ir.FunctionType(DOUBLE, [DOUBLE] * len(values)), self.builder.module
+        """A function of the C library, of every entry of registers."""
+        if not any(isinstance(value.type, ir.VectorType) for value in values):
+            return self._called(name, DOUBLE, values)
+        wide, out = [self.wide(value) for value in values], ir.Constant(self.register, ir.Undefined)
+        for k in range(self.width):
+            place = ir.Constant(_SHORT, k)
+            one = self._called(name, DOUBLE, [self.builder.extract_element(value, place) for value in wide])
+            out = self.builder.insert_element(out, one, place)
+        return out
+
+    def _called(self, name: str, of: ir.Type, values: Sequence[ir.Value]) -> ir.Value:
+        """A function; the C library's error number is not looked at, so that equal calls are one."""
+        kind, module = ir.FunctionType(of, [of] * len(values)), self.builder.module
         function = module.globals.get(name)
         if function is None:
             function = ir.Function(module, kind, name)
@@ -125,7 +167,9 @@ class Arithmetic:
 
     def built_in(self, name: str, *values: ir.Value) -> ir.Value:
         """A function that LLVM knows."""
-        return self.called(f"llvm.{name}.f64", *values)
+        if not any(isinstance(value.type, ir.VectorType) for value in values):
+            return self._called(f"llvm.{name}.f64", DOUBLE, values)
+        return self._called(f"llvm.{name}.v{self.width}f64", self.register, [self.wide(value) for value in values])
 
     def power(self, a: ir.Value, exponent: int) -> ir.Value:
         """An integer power by squaring."""
@@ -140,8 +184,7 @@ class Arithmetic:
 
 
 def _is_real(dual: Dual) -> bool:
-    kind = dual.value.type
-    return (kind.element if isinstance(kind, ir.VectorType) else kind) == DOUBLE
+    return bool(kind_of(dual.value) == DOUBLE)
 
 
 _Rule = Callable[..., Dual]
@@ -150,7 +193,7 @@ _Rule = Callable[..., Dual]
 def _linear(real: str, whole: str) -> _Rule:
     def rule(on: Arithmetic, p: Any, a: Dual, b: Dual) -> Dual:
         if not _is_real(a):
-            return Dual(getattr(on.builder, whole)(a.value, b.value))
+            return Dual(getattr(on.builder, whole)(*on.pair(a.value, b.value)))
         what = getattr(on, real)
         return Dual(what(a.value, b.value), what(a.slope, b.slope))
 
@@ -159,13 +202,13 @@ def _linear(real: str, whole: str) -> _Rule:
 
 def _product(on: Arithmetic, p: Any, a: Dual, b: Dual) -> Dual:
     if not _is_real(a):
-        return Dual(on.builder.mul(a.value, b.value))
+        return Dual(on.builder.mul(*on.pair(a.value, b.value)))
     return Dual(on.times(a.value, b.value), on.plus(on.times(a.slope, b.value), on.times(a.value, b.slope)))
 
 
 def _quotient(on: Arithmetic, p: Any, a: Dual, b: Dual) -> Dual:
     if not _is_real(a):
-        return Dual(on.builder.sdiv(a.value, b.value))
+        return Dual(on.builder.sdiv(*on.pair(a.value, b.value)))
     value, left = on.over(a.value, b.value), None
     if a.slope is not None or b.slope is not None:
         left = on.minus(a.slope, on.times(value, b.slope))
@@ -176,9 +219,8 @@ def _quotient(on: Arithmetic, p: Any, a: Dual, b: Dual) -> Dual:
 def _compared(sign: str) -> _Rule:
     def rule(on: Arithmetic, p: Any, a: Dual, b: Dual) -> Dual:
         if not _is_real(a):
-            return Dual(on.builder.icmp_signed(sign, a.value, b.value))
-        compare = on.builder.fcmp_unordered if sign == "!=" else on.builder.fcmp_ordered
-        return Dual(compare(sign, a.value, b.value))
+            return Dual(on.builder.icmp_signed(sign, *on.pair(a.value, b.value)))
+        return Dual(on.compared(sign, a.value, b.value))
 
     return rule
 
@@ -187,26 +229,26 @@ def _larger(sign: str) -> _Rule:
     def rule(on: Arithmetic, p: Any, a: Dual, b: Dual) -> Dual:
         build = on.builder
         if not _is_real(a):
-            return Dual(build.select(build.icmp_signed(sign, a.value, b.value), a.value, b.value))
-        first = build.fcmp_ordered(sign, a.value, b.value)
+            return Dual(on.chosen(build.icmp_signed(sign, *on.pair(a.value, b.value)), a.value, b.value))
+        first = on.compared(sign, a.value, b.value)
         # What is no number stays so, on either side.
-        value = build.select(build.or_(first, build.fcmp_unordered("uno", a.value, a.value)), a.value, b.value)
+        stays = build.or_(*on.pair(first, on.compared("uno", a.value, a.value)))
+        value = on.chosen(stays, a.value, b.value)
         if a.slope is None and b.slope is None:
             return Dual(value)
         half, one, none = map(on.number, (0.5, 1.0, 0.0))
-        tied = build.select(build.fcmp_ordered("==", a.value, b.value), half, none)  # as JAX has it
-        weight = build.select(first, one, tied)
+        tied = on.chosen(on.compared("==", a.value, b.value), half, none)  # as JAX has it
+        weight = on.chosen(first, one, tied)
         return Dual(value, on.plus(on.times(weight, a.slope), on.times(on.minus(one, weight), b.slope)))
 
     return rule
 
 
 def _bounded(on: Arithmetic, p: Any, low: Dual, a: Dual, high: Dual) -> Dual:
-    build = on.builder
     value = RULES["min"](on, p, RULES["max"](on, p, Dual(a.value), Dual(low.value)), Dual(high.value)).value
     if a.slope is None:
         return Dual(value)
-    inside = build.and_(build.fcmp_ordered("<", low.value, a.value), build.fcmp_ordered("<", a.value, high.value))
+    inside = on.builder.and_(*on.pair(on.compared("<", low.value, a.value), on.compared("<", a.value, high.value)))
     return Dual(value, on.chosen(inside, on.slope(a), ir.Constant(on.register, None)))
 
 
@@ -224,8 +266,8 @@ def _power(on: Arithmetic, p: Any, a: Dual, b: Dual) -> Dual:
         rate = on.times(b.value, on.called("pow", a.value, on.minus(b.value, on.number(1.0))))
         slope = on.times(rate, a.slope)
     if b.slope is not None:
-        zero = on.builder.fcmp_ordered("==", a.value, on.number(0.0))
-        log = on.built_in("log", on.builder.select(zero, on.number(1.0), a.value))  # as JAX has it
+        zero = on.compared("==", a.value, on.number(0.0))
+        log = on.built_in("log", on.chosen(zero, on.number(1.0), a.value))  # as JAX has it
         slope = on.plus(slope, on.times(on.times(log, value), b.slope))
     return Dual(value, slope)
 
@@ -239,8 +281,8 @@ def _direction(on: Arithmetic, p: Any, y: Dual, x: Dual) -> Dual:
 
 
 def _sign(on: Arithmetic, a: ir.Value) -> ir.Value:
-    stays = on.builder.fcmp_unordered("ueq", a, on.number(0.0))  # zeros, and what is no number
-    return on.builder.select(stays, a, on.built_in("copysign", on.number(1.0), a))
+    stays = on.compared("ueq", a, on.number(0.0))  # zeros, and what is no number
+    return on.chosen(stays, a, on.built_in("copysign", on.number(1.0), a))
 
 
 def _size(on: Arithmetic, p: Any, a: Dual) -> Dual:
@@ -250,7 +292,7 @@ def _size(on: Arithmetic, p: Any, a: Dual) -> Dual:
 
 
 def _chosen(on: Arithmetic, p: Any, which: Dual, *cases: Dual) -> Dual:
-    if len(cases) != 2 or which.value.type != _BIT:
+    if len(cases) != 2 or kind_of(which.value) != _BIT:
         raise Unsupported("a choice among more than two")
     no, yes = cases
     slope = None
@@ -260,18 +302,18 @@ def _chosen(on: Arithmetic, p: Any, which: Dual, *cases: Dual) -> Dual:
 
 
 def _converted(on: Arithmetic, p: Any, a: Dual) -> Dual:
-    build, new, old = on.builder, type_of(p["new_dtype"]), a.value.type
-    if new == old or isinstance(old, ir.VectorType):
+    build, new, old = on.builder, type_of(p["new_dtype"]), kind_of(a.value)
+    if new == old:
         return a
+    to = ir.VectorType(new, on.width) if isinstance(a.value.type, ir.VectorType) else new
     if DOUBLE not in (new, old):
         if new == _BIT:
-            return Dual(build.icmp_signed("!=", a.value, ir.Constant(old, 0)))
+            return Dual(build.icmp_signed("!=", *on.pair(a.value, ir.Constant(old, 0))))
         widened = build.zext if old == _BIT else build.sext
-        return Dual(build.trunc(a.value, new) if new.width < old.width else widened(a.value, new))
+        return Dual(build.trunc(a.value, to) if new.width < old.width else widened(a.value, to))
     if new == DOUBLE:
-        return Dual((build.uitofp if old == _BIT else build.sitofp)(a.value, new))
-    zero = on.number(0.0)
-    return Dual(build.fcmp_unordered("!=", a.value, zero) if new == _BIT else build.fptosi(a.value, new))
+        return Dual((build.uitofp if old == _BIT else build.sitofp)(a.value, to))
+    return Dual(on.compared("!=", a.value, on.number(0.0)) if new == _BIT else build.fptosi(a.value, to))
 
 
 def _negative(on: Arithmetic, p: Any, a: Dual) -> Dual:
@@ -281,7 +323,12 @@ def _negative(on: Arithmetic, p: Any, a: Dual) -> Dual:
 
 
 def _finite(on: Arithmetic, p: Any, a: Dual) -> Dual:
-    return Dual(on.builder.fcmp_ordered("<", on.built_in("fabs", a.value), on.number(math.inf)))
+    return Dual(on.compared("<", on.built_in("fabs", a.value), on.number(math.inf)))
+
+
+def _cleaned(on: Arithmetic, a: ir.Value) -> ir.Value:
+    """Zero for what is not finite."""
+    return on.chosen(_finite(on, None, Dual(a)).value, a, on.number(0.0))
 
 
 def _smooth(name: str, rate: Callable[[Arithmetic, ir.Value, ir.Value], ir.Value], built_in: bool = False) -> _Rule:
@@ -317,7 +364,7 @@ def _one_and(square: float) -> Callable[[Arithmetic, ir.Value, ir.Value], ir.Val
 
 
 def _bits(name: str) -> _Rule:
-    return lambda on, p, a, b: Dual(getattr(on.builder, name)(a.value, b.value))
+    return lambda on, p, a, b: Dual(getattr(on.builder, name)(*on.pair(a.value, b.value)))
 
 
 RULES: dict[str, _Rule] = {
@@ -340,6 +387,7 @@ RULES: dict[str, _Rule] = {
     "div": _quotient,
     "eq": _compared("=="),
     "exp": _smooth("exp", lambda on, x, f: f),
+    "finite_or_zero": lambda on, p, a: Dual(_cleaned(on, a.value), None if a.slope is None else _cleaned(on, a.slope)),
     "ge": _compared(">="),
     "gt": _compared(">"),
     "integer_pow": _integer_power,
@@ -360,6 +408,7 @@ RULES: dict[str, _Rule] = {
     "sin": _smooth("sin", lambda on, x, f: on.called("cos", x)),
     "sinh": _smooth("sinh", lambda on, x, f: on.called("cosh", x)),
     "sqrt": _smooth("sqrt", lambda on, x, f: on.over(on.number(0.5), f), built_in=True),
+    "stop_gradient": lambda on, p, a: Dual(a.value),
     "square": lambda on, p, a: _integer_power(on, {"y": 2}, a),
     "sub": _linear("minus", "sub"),
     "tan": _smooth("tan", _one_and(1.0)),

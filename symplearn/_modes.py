@@ -14,6 +14,7 @@ from scipy.spatial.distance import cdist
 from ._arviz import arviz
 from ._errors import InputError
 from ._fit import Estimate, fit
+from ._lane_loops import with_lane_loops
 from ._parameters import flatten
 from ._posterior import Posterior, evenly, log_posterior_of, models_at
 from ._sampler import LogDensity, possible
@@ -138,7 +139,7 @@ def _falls(density: Any, start: np.ndarray, end: np.ndarray, heights: np.ndarray
 
 @eqx.filter_jit
 def _values(density, stops):
-    return possible(jax.vmap(jax.vmap(density))(stops))
+    return possible(jax.vmap(jax.vmap(with_lane_loops(density)))(stops))
 
 
 def _share(inside: np.ndarray, posterior: Posterior) -> tuple[float, float]:

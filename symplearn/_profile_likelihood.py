@@ -13,6 +13,7 @@ from ._descent import Place, stacked, start
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
 from ._fit import Estimate
+from ._lane_loops import with_lane_loops
 from ._laplace_kinks import EVALUATIONS, Task
 from ._parameters import flatten, named_parameters, value_of
 
@@ -143,7 +144,7 @@ def _width(centre: Place, k: int, estimate: Estimate, task: Task) -> float:
 def _scores(model: Any, free: Array, series: Any, objective: Any) -> Array:
     """Minus the log likelihood at many free coordinates, (side, trial, parameter)."""
     rebuild = flatten(model)[1]
-    return jax.lax.map(jax.vmap(lambda x: objective(rebuild(x), series)), free)
+    return jax.lax.map(jax.vmap(with_lane_loops(lambda x: objective(rebuild(x), series))), free)
 
 
 def _profiled(estimate: Estimate, task: Task, lanes: Array, k: int) -> Place:

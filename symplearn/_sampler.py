@@ -14,6 +14,7 @@ from ._blocks import Course
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
 from ._fit import guarded
+from ._lane_loops import with_lane_loops
 from ._whitening import Whitening
 
 LogDensity = Callable[[Any], Any]
@@ -92,7 +93,7 @@ def whitened(density: LogDensity, start: Whitening, slopes: bool = False) -> Log
         return possible(density(start.free(z))) + start.log_volume
 
     if not slopes:
-        return log_density
+        return with_lane_loops(log_density)
     minus = guarded(lambda z: -log_density(z), start.centre.shape[0])
     return lambda z: -minus(z)
 

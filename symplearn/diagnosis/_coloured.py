@@ -87,12 +87,12 @@ def remembered(columns, loadings, variances, gaps, shapes, visit, start):
 
 
 def squares(columns, loadings, variances, gaps, shapes):
-    """Sum of the first column's squared whitened innovations, and of the log innovation variances."""
+    """Sums of every column's squared whitened innovations, and of the log innovation variances."""
 
     def visit(total, e, S):
-        return total + e[0] ** 2 / S, None
+        return total + e**2 / S, None
 
-    return remembered(columns, loadings, variances, gaps, shapes, visit, jnp.zeros(()))[:2]
+    return remembered(columns, loadings, variances, gaps, shapes, visit, jnp.zeros(columns.shape[0]))[:2]
 
 
 def gram(columns, loadings, variances, gaps, shapes):
@@ -127,7 +127,8 @@ def _alone(what):
 
 _series = jax.jit(_alone(whitened))
 _lanes = jax.jit(jax.vmap(_alone(whitened), (0, None, None, 0, 0, 0)))
-_on_grid = jax.jit(jax.vmap(jax.vmap(_alone(squares), (None, None, None, 0, 0, 0)), (0, *[None] * 5)))
+# Lanes are columns here: what they have in common, the filter's gains, is worked out once.
+_on_grid = jax.jit(jax.vmap(_alone(squares), (None, None, None, 0, 0, 0)))
 _grams = jax.jit(jax.vmap(_alone(gram), (0, None, None, 0, 0, 0)))
 
 
@@ -181,9 +182,9 @@ def fit_colour(
     for x, w, t in zip(residuals, weight, times, strict=True):
         some = slice(max(0, (len(t) - MOST_ROWS) // 2), max(0, (len(t) - MOST_ROWS) // 2) + MOST_ROWS)
         rows = row_variances(w[some]), row_gaps(t[some])
-        parts = [_on_grid(filled(x[c][:, None, some]), *rows, ratio, frequency, damping) for c in _chunks(len(x))]
-        square = square + np.concatenate([np.asarray(a) for a, _ in parts])[: len(x)]
-        logs = logs + np.concatenate([np.asarray(b) for _, b in parts])[: len(x)]
+        parts = [_on_grid(filled(x[c][:, some]), *rows, ratio, frequency, damping) for c in _chunks(len(x))]
+        square = square + np.concatenate([np.asarray(a).T for a, _ in parts])[: len(x)]
+        logs = logs + np.asarray(parts[0][1])
         number += int((w[some] > 0).sum())
     white = np.maximum(square, 1e-300) / number if known is None else np.full_like(square, known**2)
     value = -0.5 * (number * np.log(white) + square / white + logs)

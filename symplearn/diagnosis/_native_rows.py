@@ -8,12 +8,10 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import jax
-import llvmlite.binding as llvm
 import numpy as np
 from jax import ShapeDtypeStruct
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import Bool, Float, Int
-from llvmlite import ir
 
 import integrators as ig
 
@@ -21,6 +19,7 @@ from .._augmented import Equations
 from .._augmented_flow import SimulatedFlow, SimulatedReading, Span
 from .._augmented_system import Switches
 from .._machine_rules import Unsupported
+from .._native import compiled
 from ._course import Course
 from ._row_loop import MANY, POINTERS, row_loop
 from ._row_loop import WIDTH as WIDTH
@@ -80,7 +79,7 @@ class NativeRows:
         sizes = 2 * equations.width, len(equations.parameters), equations.size
         self.state, self.shown = sizes[0], len(equations.columns) + sizes[0]
         program = _traced(equations, integrator, sizes, inputs)
-        self._engine = _compiled(row_loop(program, sizes, inputs, _SWITCHES))
+        self._engine = compiled(row_loop(program, sizes, inputs, _SWITCHES))
         kinds = [ctypes.c_int64, ctypes.c_int64, *[ctypes.c_void_p] * POINTERS]
         self._run = ctypes.CFUNCTYPE(None, *kinds)(self._engine.get_function_address("rows"))
 
@@ -120,20 +119,3 @@ def _traced(equations: Equations, integrator: ig.AbstractIntegrator, sizes: Sequ
     span = shaped(), shaped(), shaped(dtype=int), shaped(MANY if inputs else 1, inputs)
     switches = [shaped(dtype=bool)] * _SWITCHES
     return jax.make_jaxpr(row)(*(shaped(n) for n in sizes), shaped(), shaped(inputs), *span, *switches)
-
-
-def _compiled(module: ir.Module) -> Any:
-    """The engine that holds the machine code of a module."""
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    machine = llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=2, jit=True
-    )
-    checked = llvm.parse_assembly(str(module))
-    checked.verify()
-    options = llvm.create_pipeline_tuning_options(speed_level=2)
-    builder = llvm.create_pass_builder(machine, options)
-    builder.getModulePassManager().run(checked, builder)
-    engine = llvm.create_mcjit_compiler(checked, machine)
-    engine.finalize_object()
-    return engine

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .._lane_loops import with_lane_loops
 from ._trajectory import Stepper
 
 
@@ -68,11 +69,15 @@ def _lengthened(values: np.ndarray, length: int) -> np.ndarray:
     return np.pad(values, [(0, 0), (0, length - values.shape[1])] + [(0, 0)] * (values.ndim - 2))
 
 
-def _diffusion(A: Array, intensity: Array, length: Array) -> Array:
+def _pushed(intensity: Array, state: int) -> Array:
+    """A square root of what a white force adds to a phase point per unit of time. An unseen oscillator's momentum
+    gets none: it follows."""
+    d = intensity.shape[0]
+    return jnp.zeros((state, d)).at[state // 2 + np.arange(d), np.arange(d)].set(jnp.sqrt(intensity))
+
+
+def _diffusion(A: Array, start: Array, length: Array) -> Array:
     """Covariance a white force adds over one span, by Simpson's rule over the time it acts. Of the phase point."""
-    d, state = intensity.shape[0], A.shape[0]
-    momentum = state // 2 + jnp.arange(d)  # an unseen oscillator's, which follows, gets no force
-    start = jnp.zeros((state, d)).at[momentum, jnp.arange(d)].set(jnp.sqrt(intensity))
     end, middle = A @ start, 0.5 * (start + A @ start)
     return length / 6 * (end @ end.T + 4 * middle @ middle.T + start @ start.T)
 
@@ -81,11 +86,11 @@ def forward(linear: Linear, variances: Array, intensity: Array, lengths: Array) 
     """Filter the columns [1, x_0, theta]; `variances` (time, channel) of the readings, 0 where there is none."""
     state, theta = linear.A.shape[-1], linear.T.shape[-1]
     size = 1 + state + theta
-    means = jnp.zeros((state, size)).at[:, 1 : 1 + state].set(jnp.eye(state))
+    means, pushed = jnp.zeros((state, size)).at[:, 1 : 1 + state].set(jnp.eye(state)), _pushed(intensity, state)
     zeros = jnp.zeros((linear.H.shape[1], state))
 
     def step(carry, data):
-        M, P, gram, logs = carry
+        M, P, logs = carry
         lin, r, length = data
         M0, P0 = M, P
         own = jnp.concatenate([lin.residual[:, None], jnp.zeros_like(zeros), -lin.G], axis=1)
@@ -97,16 +102,18 @@ def forward(linear: Linear, variances: Array, intensity: Array, lengths: Array) 
             S = jnp.where(seen, h @ P @ h + r[j], 1.0)
             K = jnp.where(seen, P @ h / S, 0.0)
             e = jnp.where(seen, own[j] - h @ M, 0.0)
-            gram, logs = gram + jnp.outer(e, e) / S, logs + jnp.where(seen, jnp.log(S), 0.0)
+            logs = logs + jnp.where(seen, jnp.log(S), 0.0)
             M, P = M + jnp.outer(K, e), P - jnp.outer(K, K) * S
             gains, innovations, spread = [*gains, K], [*innovations, e], [*spread, S]
         kept = (M0, P0, jnp.stack(gains), jnp.stack(innovations), jnp.stack(spread))
         drift = jnp.concatenate([lin.defect[:, None], jnp.zeros((state, state)), lin.T], axis=1)
-        P = lin.A @ P @ lin.A.T + _diffusion(lin.A, intensity, length)
-        return (lin.A @ M + drift, 0.5 * (P + P.T), gram, logs), kept
+        P = lin.A @ P @ lin.A.T + _diffusion(lin.A, pushed, length)
+        return (lin.A @ M + drift, 0.5 * (P + P.T), logs), kept
 
-    start = (means, jnp.zeros((state, state)), jnp.zeros((size, size)), jnp.zeros(()))
-    (_, _, gram, logs), kept = jax.lax.scan(step, start, (linear, variances, lengths))
+    start = (means, jnp.zeros((state, state)), jnp.zeros(()))
+    (_, _, logs), kept = jax.lax.scan(step, start, (linear, variances, lengths))
+    innovations, spread = kept[3], kept[4]
+    gram = jnp.einsum("tjc,tjd->cd", innovations / spread[..., None], innovations)
     return Pass(gram, logs, *kept)
 
 
@@ -123,17 +130,17 @@ def backward(linear: Linear, done: Pass, variances: Array, delta: Array) -> Smoo
 
     def step(carry, data):
         adjoint, information = carry
-        lin, M, P, K, e, S, r = data
+        H, x, P, K, e, S, r = data
         own: list[Array] = []
-        for j in reversed(range(lin.H.shape[0])):
-            h, seen = lin.H[j], r[j] > 0
-            u = jnp.where(seen, e[j] @ column / S[j] + K[j] @ adjoint, 0.0)
+        for j in reversed(range(H.shape[0])):
+            h, seen = H[j], r[j] > 0
+            u = jnp.where(seen, e[j] / S[j] + K[j] @ adjoint, 0.0)
             D = jnp.where(seen, 1 / S[j] + K[j] @ information @ K[j], 0.0)
             own = [r[j] ** 2 * u**2 + r[j] - r[j] ** 2 * D, *own]
             keep = jnp.eye(h.shape[0]) - jnp.outer(K[j], h)
-            adjoint = jnp.where(seen, keep.T @ adjoint - h * (e[j] @ column) / S[j], adjoint)
+            adjoint = jnp.where(seen, keep.T @ adjoint - h * e[j] / S[j], adjoint)
             information = jnp.where(seen, keep.T @ information @ keep + jnp.outer(h, h) / S[j], information)
-        shift = M @ column - P @ adjoint
+        shift = x - P @ adjoint
         return (adjoint, information), (shift, jnp.stack(own), adjoint)
 
     def through(carry, data):
@@ -144,10 +151,11 @@ def backward(linear: Linear, done: Pass, variances: Array, delta: Array) -> Smoo
     d = linear.A.shape[-1]
     # The span after a row carries its adjoint back; nothing follows the last row.
     spans = linear.A.at[-1].set(0.0)
-    data = (spans, linear, done.means, done.covariances, done.gains, done.innovations, done.variances, variances)
+    moved, innovations = done.means @ column, done.innovations @ column
+    data = (spans, linear.H, moved, done.covariances, done.gains, innovations, done.variances, variances)
     _, (shift, own) = jax.lax.scan(through, (jnp.zeros(d), jnp.zeros((d, d))), data, reverse=True)
     return Smooth(shift, own)
 
 
-forward_lanes = eqx.filter_jit(jax.vmap(forward))
-backward_lanes = eqx.filter_jit(jax.vmap(backward))
+forward_lanes = eqx.filter_jit(jax.vmap(with_lane_loops(forward)))
+backward_lanes = eqx.filter_jit(jax.vmap(with_lane_loops(backward)))

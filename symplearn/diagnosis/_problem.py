@@ -48,7 +48,7 @@ class Calibrated:
     upper: Float[np.ndarray, " f"]
     recordings: Float[np.ndarray, "recording f"]  # 1 where it acts, 0 where a term is not in the recording
 
-    @property
+    @cached_property
     def size(self) -> int:
         return len(self.names)
 
@@ -77,26 +77,26 @@ class Problem:
     units: dict[str, str]
     known_outliers: tuple[int, ...] = ()  # columns whose outliers the file knows of
 
-    @property
+    @cached_property
     def state(self) -> int:
         """Dimension of the phase space."""
         return 2 * self.equations.width
 
-    @property
+    @cached_property
     def channels(self) -> int:
         return len(self.equations.columns)
 
-    @property
+    @cached_property
     def head(self) -> int:
         """Where the calibrated values start in z."""
         return self.state * len(self.rows)
 
-    @property
+    @cached_property
     def slots(self) -> int:
         """Where the values of effects start in z."""
         return self.head + self.calibrated.size
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Length of z."""
         return self.slots + SLOTS
@@ -124,11 +124,17 @@ class Problem:
 
     def placed(self, combination: Sequence[int]) -> list[tuple[int, slice]]:
         """Members with where their values stand in z."""
-        out, first = [], self.slots
-        for member in combination:
-            out.append((member, slice(first, first + self.candidate(member).effect.size)))
-            first += self.candidate(member).effect.size
-        return out
+        known, key = self._placed, tuple(combination)
+        if key not in known:
+            sizes = [self.candidate(member).effect.size for member in key]
+            ends = np.cumsum([self.slots, *sizes]).tolist()
+            known[key] = [(m, slice(a, b)) for m, a, b in zip(key, ends[:-1], ends[1:], strict=True)]
+        return list(known[key])
+
+    @cached_property
+    def _placed(self) -> dict[tuple[int, ...], list[tuple[int, slice]]]:
+        """What was asked of `placed` before."""
+        return {}
 
     def carried(
         self, z: Float[np.ndarray, " z"], before: Combination, combination: Combination

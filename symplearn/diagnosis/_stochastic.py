@@ -13,6 +13,7 @@ import integrators as ig
 
 from .._augmented_flow import Span
 from .._filter import Filtered, unscented_filter
+from .._lane_loops import with_lane_loops
 from .._model import Gaussian, StateSpaceModel
 from .._smoother import Smoothed, smooth_along
 from ._calibrate import THINNED
@@ -86,7 +87,8 @@ def filter_lane(
     n = readings.shape[0]
     spans = jax.tree.map(lambda leaf: leaf[: n - 1], (course.spans, exposure))
     contexts = ((course.times[:n], course.inputs[:n]), roots)
-    return model, spans, contexts, unscented_filter(model, readings * roots, spans, contexts)
+    filtered = with_lane_loops(lambda scaled: unscented_filter(model, scaled, spans, contexts))(readings * roots)
+    return model, spans, contexts, filtered
 
 
 _filter = eqx.filter_jit(filter_lane)

@@ -1,0 +1,227 @@
+"""Loops over time that are machine code where a function is mapped over many lanes.
+
+Of a filter's step XLA makes hundreds of small loops over all lanes, from memory to memory; machine code keeps eight
+lanes side by side in registers. What the code does not know, few lanes, and graphics cards, are XLA's.
+"""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
+from jax.interpreters import ad, batching, mlir
+
+from ._foreign_call import registered
+from ._machine_lanes import lane_loop, width_for
+from ._machine_rules import Unsupported
+from ._native import compiled
+
+_Told = TypeVar("_Told")
+# Numbers of an array that is written into a loop's function.
+_WRITTEN = 4096
+# Traced functions that are looked into for loops, and where they keep what they do.
+_CALLS = {
+    "closed_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "jit": "jaxpr",
+    "remat2": "jaxpr",
+}
+
+
+def with_lane_loops(function: Callable[..., _Told]) -> Callable[..., _Told]:
+    """The same function, whose loops are machine code under `jax.vmap`. Derivatives of it are XLA's: take
+    this of a gradient, not a gradient of this."""
+
+    def looped(*args: Any) -> _Told:
+        program, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
+        found = _evaluated(program.jaxpr, program.consts, jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(shapes), found)
+
+    return looped
+
+
+def _evaluated(program: Jaxpr, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]:
+    """What a traced function yields, with loops as operations of their own."""
+    known = dict(zip([*program.constvars, *program.invars], [*consts, *args], strict=True))
+
+    def value(atom: Any) -> Any:
+        return atom.val if isinstance(atom, Literal) else known[atom]
+
+    for one in program.eqns:
+        name, values = one.primitive.name, [value(atom) for atom in one.invars]
+        if name == "scan":
+            found = _bound(values, one.params)
+        elif name in _CALLS and _has_loops(one.params[_CALLS[name]]):
+            inner = one.params[_CALLS[name]]
+            closed = isinstance(inner, ClosedJaxpr)
+            found = _evaluated(inner.jaxpr if closed else inner, inner.consts if closed else (), values)
+        else:
+            found = one.primitive.bind(*values, **one.primitive.get_bind_params(one.params))
+            found = found if one.primitive.multiple_results else [found]
+        known.update(zip(one.outvars, found, strict=True))
+    return [value(atom) for atom in program.outvars]
+
+
+def _bound(values: Sequence[Any], p: Any) -> list[Any]:
+    """A loop as an operation of its own. What it is given and is known is written into its function: places in arrays,
+    and matrices most of whose entries are zero."""
+    inner, known = p["jaxpr"].jaxpr, {}
+    for k, value in enumerate(values[: p["num_consts"]]):
+        if not isinstance(value, jax.core.Tracer) and np.size(value) <= _WRITTEN:
+            known[k] = np.asarray(value, inner.invars[k].aval.dtype)
+    return _loop.bind(*values, known=_Known(known), **p)
+
+
+def _has_loops(program: ClosedJaxpr | Jaxpr) -> bool:
+    inner = program.jaxpr if isinstance(program, ClosedJaxpr) else program
+    return any(
+        one.primitive.name == "scan"
+        or (one.primitive.name in _CALLS and _has_loops(one.params[_CALLS[one.primitive.name]]))
+        for one in inner.eqns
+    )
+
+
+def _as_scan(*values: Any, known: Any, **p: Any) -> list[Any]:
+    """The loop as XLA has it."""
+    return jax.lax.scan_p.bind(*values, **p)
+
+
+def _batched(values: Sequence[Any], axes: Sequence[int | None], **p: Any) -> tuple[list[Any], list[int]]:
+    """The loop of many lanes: by machine code where it can be written."""
+    size = next(value.shape[axis] for value, axis in zip(values, axes, strict=True) if axis is not None)
+    lanes = size + -size % width_for(size)
+    name = None
+    if jax.default_backend() == "cpu":
+        name = _code_of(_Loop(p), tuple(axis is not None for axis in axes), lanes)
+    if name is None:
+        found = jax.vmap(lambda *some: _as_scan(*some, **p), tuple(axes), axis_size=size)(*values)
+        return found, [0] * len(found)
+    operands = [value if axis is None else _filled(jnp.moveaxis(value, axis, -1), lanes)
+                for value, axis in zip(values, axes, strict=True)]  # fmt: skip
+    beside = tuple(axis is not None for axis in axes)
+    found = [one[..., :size] for one in _many.bind(*operands, beside=beside, lanes=lanes, **p)]
+    return found, [one.ndim - 1 for one in found]
+
+
+def _by_machine(*operands: Any, beside: tuple[bool, ...], lanes: int, **p: Any) -> list[Any]:
+    """The loop of so many lanes, which is known to be written; those of operands that are `beside` each other are their
+    last axis."""
+    name = _code_of(_Loop(p), beside, lanes)
+    assert name is not None
+    return list(jax.ffi.ffi_call(name, _yielded(p, lanes))(*operands))
+
+
+def _still_more(values: Sequence[Any], axes: Sequence[int | None], **p: Any) -> tuple[list[Any], list[int]]:
+    """The loop of many times so many lanes: all beside each other."""
+    size = next(value.shape[axis] for value, axis in zip(values, axes, strict=True) if axis is not None)
+    lanes = p["lanes"]
+
+    def merged(value: Any, axis: int | None, had: bool) -> Any:
+        if axis is None:
+            if not had:
+                return value
+            value = value[..., None, :]
+        else:
+            value = jnp.moveaxis(value, axis, -2) if had else jnp.moveaxis(value, axis, -1)[..., None]
+        return jnp.broadcast_to(value, (*value.shape[:-2], size, lanes)).reshape(*value.shape[:-2], size * lanes)
+
+    operands = [merged(*one) for one in zip(values, axes, p["beside"], strict=True)]
+    beside = tuple(had or axis is not None for axis, had in zip(axes, p["beside"], strict=True))
+    found = _many.bind(*operands, **{**p, "beside": beside, "lanes": size * lanes})
+    apart = [one.reshape(*one.shape[:-1], size, lanes) for one in found]
+    return apart, [one.ndim - 2 for one in apart]
+
+
+def _alone(*values: Any, **p: Any) -> list[Any]:
+    """The loop of a single lane."""
+    name = _code_of(_Loop(p), (False,) * len(values), 1) if jax.default_backend() == "cpu" else None
+    if name is None:
+        return _as_scan(*values, **p)
+    return [one[..., 0] for one in jax.ffi.ffi_call(name, _yielded(p, 1))(*values)]
+
+
+def _filled(value: Any, lanes: int) -> Any:
+    """So many lanes: the last one again and again."""
+    lack = lanes - value.shape[-1]
+    return jnp.pad(value, [(0, 0)] * (value.ndim - 1) + [(0, lack)], mode="edge") if lack else value
+
+
+def _yielded(p: Any, *lanes: int) -> list[Any]:
+    """Shapes and types of what a loop yields, lanes last."""
+    out = []
+    for k, aval in enumerate(p["jaxpr"].out_avals):
+        along = () if k < p["num_carry"] else (p["length"],)
+        out.append(jax.core.ShapedArray((*along, *aval.shape, *lanes), aval.dtype))
+    return out
+
+
+class _Known:
+    """Arrays by their place among what a loop is given; two of the same numbers are the same."""
+
+    def __init__(self, arrays: dict[int, np.ndarray]):
+        self.arrays = arrays
+        self.key = tuple((k, one.shape, str(one.dtype), one.tobytes()) for k, one in arrays.items())
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Known) and self.key == other.key
+
+
+class _Loop:
+    """A loop's parameters, to be found again by the traced function that it repeats."""
+
+    def __init__(self, p: Any):
+        self.p, self.key = p, tuple(p[name] for name in ("length", "reverse", "num_consts", "num_carry", "known"))
+
+    def __hash__(self) -> int:
+        return hash((id(self.p["jaxpr"]), self.key))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Loop) and self.p["jaxpr"] is other.p["jaxpr"] and self.key == other.key
+
+
+_engines: dict[str, Any] = {}
+
+
+@lru_cache(maxsize=64)
+def _code_of(loop: _Loop, beside: tuple[bool, ...], lanes: int) -> str | None:
+    """The name by which XLA knows a loop's machine code; None where there is none."""
+    try:
+        module = lane_loop(loop.p, loop.p["known"].arrays, beside, lanes)
+    except Unsupported:
+        return None
+    text = str(module)
+    name = f"symplearn_lanes_{hashlib.sha256(text.encode()).hexdigest()[:24]}"
+    if name not in _engines:
+        _engines[name] = compiled(module)
+        registered(_engines[name].get_function_address("called"), name)
+    return name
+
+
+def _with_slopes(primals: Sequence[Any], slopes: Sequence[Any], **p: Any) -> Any:
+    """Derivatives are those of the loop as XLA has it."""
+    some = [ad.instantiate_zeros(slope) for slope in slopes]
+    return jax.jvp(lambda *values: _as_scan(*values, **p), tuple(primals), tuple(some))
+
+
+_loop = Primitive("loop_of_lanes")
+_loop.multiple_results = True
+_loop.def_impl(_as_scan)
+_loop.def_abstract_eval(lambda *_, **p: _yielded(p))
+mlir.register_lowering(_loop, mlir.lower_fun(_alone, multiple_results=True))
+batching.primitive_batchers[_loop] = _batched
+ad.primitive_jvps[_loop] = _with_slopes
+
+_many = Primitive("loop_of_many_lanes")
+_many.multiple_results = True
+_many.def_impl(_by_machine)
+_many.def_abstract_eval(lambda *_, lanes, **p: _yielded(p, lanes))
+mlir.register_lowering(_many, mlir.lower_fun(_by_machine, multiple_results=True))
+batching.primitive_batchers[_many] = _still_more
