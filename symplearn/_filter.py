@@ -18,6 +18,7 @@ from ._errors import InputError
 from ._faults import SENTENCES, Fault, is_fatal
 from ._filter_step import AbstractPassage, begin, measure, unscored
 from ._guard import guard
+from ._lane_loops import with_swift_slopes
 from ._model import AbstractAffine, AbstractStateSpaceModel, StateSpaceModel, slice_at
 from ._transforms import STANDARD, AbstractTransform, Moments, Taylor
 
@@ -131,9 +132,17 @@ def log_likelihood(
 ) -> Float[Array, ""]:
     """The log marginal likelihood (2.4) in nats, without a history; -1e15 where the filter failed.
 
-    Arguments as for `unscented_filter`.
+    Arguments as for `unscented_filter`. On a processor its loop over the readings is machine code where that can be
+    written, of one model or of many under `vmap`; first derivatives, in either mode, come from its reverse.
     """
-    return passage.run(model, readings, intervals, contexts, transform, keep=False)[0].log_likelihood
+    arrays, rest = eqx.partition((model, readings, intervals, contexts, transform, passage), eqx.is_array)
+    leaves, structure = jax.tree.flatten(arrays)
+
+    def of(*leaves: Array) -> Array:
+        *given, transform, passage = eqx.combine(jax.tree.unflatten(structure, leaves), rest)
+        return passage.run(*given, transform, keep=False)[0].log_likelihood
+
+    return with_swift_slopes(of)(*leaves)
 
 
 def kalman_filter(

@@ -12,8 +12,10 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
 
 from ._foreign_call import registered
 from ._machine_lanes import lane_loop, width_for
@@ -23,14 +25,8 @@ from ._native import compiled
 _Told = TypeVar("_Told")
 # Numbers of an array that is written into a loop's function.
 _WRITTEN = 4096
-# Traced functions that are looked into for loops, and where they keep what they do.
-_CALLS = {
-    "closed_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-    "jit": "jaxpr",
-    "remat2": "jaxpr",
-}
+# Traced functions that are looked into for loops, and where they keep what they do; not those with slopes of their own.
+_CALLS = {"closed_call": "call_jaxpr", "jit": "jaxpr", "remat2": "jaxpr"}
 
 
 def with_lane_loops(function: Callable[..., _Told]) -> Callable[..., _Told]:
@@ -43,6 +39,44 @@ def with_lane_loops(function: Callable[..., _Told]) -> Callable[..., _Told]:
         return jax.tree.unflatten(jax.tree.structure(shapes), found)
 
     return looped
+
+
+def with_swift_slopes(function: Callable[..., Array]) -> Callable[..., Array]:
+    """The same function of arrays to a number, with loops that are machine code in its value and in its slopes.
+
+    Those are its reverse, whichever way it is differentiated, or, where it has none, XLA's.
+    """
+
+    @jax.custom_jvp
+    def swift(*args: Array) -> Array:
+        return with_lane_loops(function)(*args)
+
+    def rule(primals: Sequence[Array], tangents: Sequence[Any]) -> tuple[Array, Array]:
+        moved = [k for k, one in enumerate(tangents) if _moves(one)]
+        along = [tangents[k] for k in moved]
+
+        def of(*some: Array) -> Array:
+            all_of = dict(enumerate(primals)) | dict(zip(moved, some, strict=True))
+            return function(*(all_of[k] for k in range(len(primals))))
+
+        begin = [primals[k] for k in moved]
+        try:
+            value, slopes = with_lane_loops(jax.value_and_grad(of, range(len(moved))))(*begin)
+        except ValueError as error:
+            # A propagator with a loop of traced length has no reverse.
+            if "Reverse-mode differentiation" not in str(error):
+                raise
+            value, slope = jax.jvp(of, begin, along)
+            return value, slope
+        parts = [jnp.sum(slope * one) for slope, one in zip(slopes, along, strict=True)]
+        return value, sum(parts, jnp.zeros(()))
+
+    swift.defjvp(rule, symbolic_zeros=True)
+    return swift
+
+
+def _moves(tangent: Any) -> bool:
+    return type(tangent) is not SymbolicZero and tangent.dtype != jax.dtypes.float0
 
 
 def _evaluated(program: Jaxpr, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]:

@@ -21,8 +21,8 @@ from ._machine_rules import INTEGER, RULES, Arithmetic, Dual, Unsupported, kind_
 
 # Loops of at most so many steps are written down step by step where that tells places in arrays.
 _FEW = 16
-# Numbers of a table that is filled when it is run.
-_MOST_KEPT = 4096
+# Bytes of all tables that are filled when they are run: they lie on the stack, which threads have half a megabyte of.
+_MOST_KEPT = 1 << 18
 
 
 class Table:
@@ -41,7 +41,7 @@ class Code(Arithmetic):
 
     def __init__(self, builder: ir.IRBuilder, width: int, beside: bool = False, most: int = sys.maxsize):
         super().__init__(builder, width, most)
-        self.beside = beside
+        self.beside, self.kept = beside, 0
         self._sloped: dict[int, tuple[Any, ClosedJaxpr]] = {}
 
     def kept_as(self, dtype: Any) -> ir.Type:
@@ -111,7 +111,7 @@ class Code(Arithmetic):
     def _table_of_lanes(self, values: np.ndarray) -> Table:
         """A table of what is known when it is run."""
         entries = [entry.value for entry in values.ravel()]
-        if not self.beside or not 0 < len(entries) <= _MOST_KEPT:
+        if not self.beside or not entries:
             raise Unsupported("a loop along what is not known")
         found = self.room(self.register_of(kind_of(entries[0])), values.shape)
         for k, entry in enumerate(entries):
@@ -120,8 +120,9 @@ class Code(Arithmetic):
 
     def room(self, kind: ir.Type, shape: tuple[int, ...]) -> Table:
         """Memory for a table that is written row by row."""
-        if math.prod(shape) > _MOST_KEPT:
-            raise Unsupported("a long table")
+        self.kept += 8 * self.width * math.prod(shape)
+        if self.kept > _MOST_KEPT:
+            raise Unsupported("much that is kept on the way")
         with self.builder.goto_entry_block():
             return Table(self.builder.alloca(kind, math.prod(shape)), shape)
 

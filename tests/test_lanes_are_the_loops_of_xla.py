@@ -9,10 +9,14 @@ from machine_operations import OF_ONE, POINT
 
 from benchmarks._cases import cherry, henon_heiles
 from symplearn import _lane_loops, _native
+from symplearn._filter import SEQUENTIAL
 from symplearn._lane_loops import with_lane_loops
 from symplearn._log_posterior import gradient, guarded
 from symplearn._machine_rules import RULES
+from symplearn._objectives import prepare
+from symplearn._parameters import flatten, resolve
 from symplearn._sampler import whitened
+from symplearn._transforms import STANDARD
 from symplearn._whitening import Whitening
 
 # Sums in another order, fused or not, and a C library's functions against XLA's.
@@ -110,8 +114,9 @@ def test_loops_are_those_of_xla(name, number, monkeypatch):
     "step",
     [lambda c, row: (jnp.sort(c), None), lambda c, row: (lax.while_loop(lambda d: d[0] < 1, lambda d: d + 1, c), None),
      lambda c, row: (jnp.cumsum(c), None),
-     lambda c, row: (c * jnp.outer(jnp.tile(c, 70), jnp.tile(jnp.sin(c), 70)).mean(), None)],
-    ids=["order", "while", "sums on the way", "much"],
+     lambda c, row: (c * jnp.outer(jnp.tile(c, 70), jnp.tile(jnp.sin(c), 70)).mean(), None),
+     lambda c, row: (lax.scan(lambda d, n: (jnp.sin(d), jnp.outer(d, d)), c, None, length=500)[1].sum(0)[0], None)],
+    ids=["order", "while", "sums on the way", "much", "much that is kept"],
 )  # fmt: skip
 def test_what_cannot_be_written_is_left_to_xla(step, monkeypatch):
     """An operation that is not known, and a function that would be too long, give the same result."""
@@ -144,6 +149,24 @@ def test_a_likelihood_and_its_gradient_are_those_of_xla(case, monkeypatch):
     # Issue 7 asks for 1e-10 of every fast path, relative to the largest entry.
     same(jax.jit(jax.vmap(with_lane_loops(both)))(places), jax.jit(jax.vmap(both))(places), 1e-10)
     assert any(names)
+
+
+def test_slopes_of_the_likelihood_are_those_of_the_filter():
+    """Whichever way the likelihood is differentiated, once or twice, one model or several, it is the filter's slope."""
+    case = henon_heiles(5, 1.0, 2)
+
+    def plain(free):
+        parts = prepare(resolve(flatten(case.model)[1](free)), case.series)
+        return -SEQUENTIAL.run(*parts, STANDARD, keep=False)[0].log_likelihood
+
+    def swift(free):
+        return case.score(free, case.series.readings)
+
+    places = case.free + 1e-3 * np.random.default_rng(2).normal(size=(3, case.free.size))
+    for way in (jax.grad, jax.jacfwd, jax.hessian, lambda f: jax.vmap(jax.grad(f))):
+        at = case.free if way in (jax.grad, jax.jacfwd, jax.hessian) else jnp.asarray(places)
+        # As above; second derivatives are what Laplace's approximation takes.
+        same(jax.jit(way(swift))(at), jax.jit(way(plain))(at), 1e-10)
 
 
 def test_a_lane_that_fails_spoils_no_other():
