@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from symplearn._lane_loops import left_to_xla
+
 from ._row import Disagreement, Effort, tell
 
 # Rounds that a median takes.
@@ -55,6 +57,12 @@ def compiled(function: Callable[..., Any], *arguments: Any) -> Contender:
     program = jax.jit(function).lower(*arguments).compile()
     seconds = time.perf_counter() - began
     return Contender(lambda: program(*arguments), seconds, planned_bytes(program))
+
+
+def compiled_by_xla(function: Callable[..., Any], *arguments: Any) -> Contender:
+    """The same without machine code of symplearn's own."""
+    with left_to_xla():
+        return compiled(function, *arguments)
 
 
 def planned_bytes(program: Any) -> int | None:

@@ -1,6 +1,7 @@
 """What a posterior costs: processor time to so many effective draws, of symplearn and of corrected DRAM."""
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -14,7 +15,7 @@ from symplearn._posterior import log_posterior_of, posterior_of
 from symplearn._sampler import Drawn
 from symplearn._whitening import whiten
 
-from ._contest import Spread, compiled
+from ._contest import Contender, Spread, compiled, compiled_by_xla
 from ._figures import seconds_told
 from ._row import Effort, Line, tell
 
@@ -31,8 +32,11 @@ def measured(what: str, estimate: sl.Estimate, sampler: Any, goal: float, effort
     given to it.
     """
     ours = _ours(what, estimate, sampler, 2 if effort.quick else 5)
-    theirs = _theirs(what, estimate, QUICK if effort.quick else SHORT)
-    return {"lines": _lines(what, ours, theirs, goal), "symplearn": ours, "dram": theirs}
+    steps = QUICK if effort.quick else SHORT
+    theirs = _theirs(what, estimate, steps, compiled_by_xla)
+    swift = _theirs(what, estimate, steps, compiled)
+    lines = [*_lines(what, ours, theirs, goal), _line_of_swift(what, ours, swift)]
+    return {"lines": lines, "symplearn": ours, "dram": theirs, "dram by machine code": swift}
 
 
 def _ours(what: str, estimate: sl.Estimate, sampler: Any, rounds: int) -> dict[str, Any]:
@@ -59,7 +63,7 @@ def _ours(what: str, estimate: sl.Estimate, sampler: Any, rounds: int) -> dict[s
     }
 
 
-def _theirs(what: str, estimate: sl.Estimate, steps: int) -> dict[str, Any]:
+def _theirs(what: str, estimate: sl.Estimate, steps: int, way: Callable[..., Contender]) -> dict[str, Any]:
     """One chain from the mode, its second half kept, as the dissertation's; by symplearn's corrected kernel."""
     density = log_posterior_of(estimate)
     start = whiten(density, flatten(estimate.model)[0])
@@ -73,7 +77,7 @@ def _theirs(what: str, estimate: sl.Estimate, steps: int) -> dict[str, Any]:
         return jax.lax.scan(step, kernel.init(start.centre), jax.random.split(key, steps))[1]
 
     tell(f"{what}: compiling DRAM")
-    program = compiled(chain, jax.random.key(1))
+    program = way(chain, jax.random.key(1))
     tell(f"{what}: DRAM, {steps} steps for {STEPS}")
     worked = time.process_time()
     kept = [rows[steps // 2 :] for rows in program()]
@@ -89,6 +93,20 @@ def _theirs(what: str, estimate: sl.Estimate, steps: int) -> dict[str, Any]:
         "effective": effective,
         "to_effective": seconds * EFFECTIVE / effective,
     }
+
+
+def _line_of_swift(what: str, ours: dict[str, Any], swift: dict[str, Any]) -> Line:
+    """Against a chain whose likelihoods are machine code as well."""
+    own, seconds = ours["to_effective"]["median"], swift["to_effective"]
+    return Line(
+        f"{what} to {EFFECTIVE:g} effective draws, processor time after mode and compilation",
+        f"corrected DRAM to {EFFECTIVE:g}, its likelihoods machine code as well, scaled from {swift['steps']} steps",
+        f"{seconds / own:.3g}x",
+        "",
+        None,
+        ours=seconds_told(own),
+        other=seconds_told(seconds),
+    )
 
 
 def _lines(what: str, ours: dict[str, Any], theirs: dict[str, Any], goal: float) -> list[Line]:

@@ -5,7 +5,9 @@ lanes side by side in registers. What the code does not know, few lanes, and gra
 """
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import lru_cache
 from typing import Any, TypeVar
 
@@ -27,6 +29,19 @@ _Told = TypeVar("_Told")
 _WRITTEN = 4096
 # Traced functions that are looked into for loops, and where they keep what they do; not those with slopes of their own.
 _CALLS = {"closed_call": "call_jaxpr", "jit": "jaxpr", "remat2": "jaxpr"}
+
+
+_left_to_xla = ContextVar("left to XLA", default=False)
+
+
+@contextmanager
+def left_to_xla() -> Iterator[None]:
+    """What is compiled within has no machine code: for comparisons."""
+    token = _left_to_xla.set(True)
+    try:
+        yield
+    finally:
+        _left_to_xla.reset(token)
 
 
 def with_lane_loops(function: Callable[..., _Told]) -> Callable[..., _Told]:
@@ -120,6 +135,10 @@ def _has_loops(program: ClosedJaxpr | Jaxpr) -> bool:
     )
 
 
+def _is_wanted() -> bool:
+    return jax.default_backend() == "cpu" and not _left_to_xla.get()
+
+
 def _as_scan(*values: Any, known: Any, **p: Any) -> list[Any]:
     """The loop as XLA has it."""
     return jax.lax.scan_p.bind(*values, **p)
@@ -129,9 +148,7 @@ def _batched(values: Sequence[Any], axes: Sequence[int | None], **p: Any) -> tup
     """The loop of many lanes: by machine code where it can be written."""
     size = next(value.shape[axis] for value, axis in zip(values, axes, strict=True) if axis is not None)
     lanes = size + -size % width_for(size)
-    name = None
-    if jax.default_backend() == "cpu":
-        name = _code_of(_Loop(p), tuple(axis is not None for axis in axes), lanes)
+    name = _code_of(_Loop(p), tuple(axis is not None for axis in axes), lanes) if _is_wanted() else None
     if name is None:
         found = jax.vmap(lambda *some: _as_scan(*some, **p), tuple(axes), axis_size=size)(*values)
         return found, [0] * len(found)
@@ -173,7 +190,7 @@ def _still_more(values: Sequence[Any], axes: Sequence[int | None], **p: Any) -> 
 
 def _alone(*values: Any, **p: Any) -> list[Any]:
     """The loop of a single lane."""
-    name = _code_of(_Loop(p), (False,) * len(values), 1) if jax.default_backend() == "cpu" else None
+    name = _code_of(_Loop(p), (False,) * len(values), 1) if _is_wanted() else None
     if name is None:
         return _as_scan(*values, **p)
     return [one[..., 0] for one in jax.ffi.ffi_call(name, _yielded(p, 1))(*values)]
