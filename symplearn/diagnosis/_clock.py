@@ -61,7 +61,7 @@ class _Piece:
         return _Piece((column @ self.columns)[None, some], self.rates[some], self.weight[some], self.times[some])
 
     @cached_property
-    def rows(self) -> tuple[Array, Array, Array]:
+    def rows(self) -> tuple[Array, Array, tuple[Array, Array]]:
         """Factors, variances and gaps, as the filter takes them."""
         loadings = np.stack([np.ones_like(self.rates), self.rates])
         return filled(loadings), row_variances(self.weight), row_gaps(self.times)

@@ -14,7 +14,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
+
+from .._lane_loops import with_lane_loops
 
 # Variance of the coloured error against the white one, its damping, and how many memory lengths are tried.
 RATIOS = np.geomspace(0.03, 1e6, 12)
@@ -27,6 +30,8 @@ _LANES = 8
 # Rows are filled up to a power of two, at least the first of these, or to a multiple of the second, so that recordings
 # share compiled functions.
 _LEAST, _ROUND = 64, 512
+# Gaps that agree to so many digits are the same.
+_DIGITS = 9
 
 
 @dataclass(frozen=True)
@@ -59,15 +64,16 @@ def remembered(columns, loadings, variances, gaps, shapes, visit, start):
     """Filter the errors' state for every column; `visit(total, e, S)` gathers innovations, `start` its first value.
 
     `shapes` are ratio, frequency and damping of one process or several, and `loadings` (process, row) the factors by
-    which they enter each row.
+    which they enter each row; `gaps` are what follows the rows, as `row_gaps` has it.
     """
     ratio, frequency, damping = shapes
+    kinds, places = gaps
     number = len(ratio)
     stationary = jnp.diag((ratio[:, None] * jnp.stack([jnp.ones_like(frequency), frequency**2], axis=1)).ravel())
 
     def step(carry, data):
         M, P, total, logs = carry
-        y, h, r, gap = data
+        y, h, r, F = data
         H = (h[:, None] * jnp.array([1.0, 0.0])).ravel()
         seen = r > 0
         S = jnp.where(seen, H @ P @ H + r, 1.0)
@@ -75,14 +81,14 @@ def remembered(columns, loadings, variances, gaps, shapes, visit, start):
         K = jnp.where(seen, P @ H / S, 0.0)
         total, kept = visit(total, e, S)
         M, P = M + K[:, None] * e, P - jnp.outer(K, K) * S
-        F = jnp.zeros_like(P)
-        for i in range(number):
-            F = F.at[2 * i : 2 * i + 2, 2 * i : 2 * i + 2].set(_transition(gap, frequency[i], damping[i]))
         P = stationary + F @ (P - stationary) @ F.T
         return (F @ M, P, total, logs + jnp.where(seen, jnp.log(S), 0.0)), kept
 
+    # Most gaps are alike, and what takes long are exponentials and cosines.
+    each = [jax.vmap(_transition, (0, None, None))(kinds, frequency[i], damping[i]) for i in range(number)]
+    transitions = jax.vmap(block_diag)(*each)[places]
     begin = (jnp.zeros((2 * number, columns.shape[0])), stationary, start, jnp.zeros(()))
-    (_, _, total, logs), kept = jax.lax.scan(step, begin, (columns.T, loadings.T, variances, gaps))
+    (_, _, total, logs), kept = jax.lax.scan(step, begin, (columns.T, loadings.T, variances, transitions))
     return total, logs, kept
 
 
@@ -128,7 +134,7 @@ def _alone(what):
 _series = jax.jit(_alone(whitened))
 _lanes = jax.jit(jax.vmap(_alone(whitened), (0, None, None, 0, 0, 0)))
 # Lanes are columns here: what they have in common, the filter's gains, is worked out once.
-_on_grid = jax.jit(jax.vmap(_alone(squares), (None, None, None, 0, 0, 0)))
+_on_grid = jax.jit(jax.vmap(with_lane_loops(_alone(squares)), (None, None, None, 0, 0, 0)))
 _grams = jax.jit(jax.vmap(_alone(gram), (0, None, None, 0, 0, 0)))
 
 
@@ -143,8 +149,13 @@ def row_variances(weight: np.ndarray) -> Array:
     return filled(np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0))
 
 
-def row_gaps(times: np.ndarray) -> Array:
-    return filled(np.append(np.diff(times), 0.0))
+def row_gaps(times: np.ndarray) -> tuple[Array, Array]:
+    """The different gaps that follow the rows, the first of them none, and which one follows each row."""
+    gaps = np.diff(times)
+    unit = float(np.median(gaps)) if len(gaps) else 1.0
+    shares, places = np.unique(np.append(np.round(gaps / unit, _DIGITS), 0.0), return_inverse=True)
+    kinds = np.pad(shares * unit, (0, (1 << (len(shares) - 1).bit_length()) - len(shares)))
+    return jax.device_put(kinds), filled(places)
 
 
 def filled(values: np.ndarray) -> Array:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from .. import _effects as effects
 from ._calibrate import Priors
 from ._problem import Combination, Problem
-from ._strength import mixture_gain, mixture_gains
+from ._strength import mixture_gains
 
 
 @dataclass(frozen=True)
@@ -164,8 +164,11 @@ def scores(
     gains = others.gain + 0.5 * (push * amplitudes).sum(1) + 0.5 * np.linalg.slogdet(spread)[1] - np.log(scales).sum(1)
     steps = others.step - np.einsum("lza,la->lz", after, amplitudes)
     if effect is effects.HIDDEN:
-        gains += [_unseen_strength(problem, one.member, priors, others, *lane)
-                  for one, *lane in zip(responses, after, amplitudes, spread, steps, strict=True)]  # fmt: skip
+        members = np.array([one.member for one in responses])
+        for member in np.unique(members):
+            own = members == member
+            lanes = after[own], amplitudes[own], spread[own], steps[own]
+            gains[own] += _unseen_strengths(problem, int(member), priors, others, *lanes)
     else:
         shape = scales[:, :, None] * scales[:, None, :]
         gains += mixture_gains(amplitudes / scales, spread / shape, np.zeros(number, int), lowest)
@@ -176,21 +179,25 @@ def scores(
             for k, one in enumerate(responses)]  # fmt: skip
 
 
-def _unseen_strength(
-    problem: Problem, member: int, priors: Priors, others: Nuisance, after: np.ndarray, amplitudes: np.ndarray,
-    spread: np.ndarray, step: np.ndarray,
-) -> float:  # fmt: skip
-    """What an unseen oscillator gains for being of any strength: its amplitude and its start together."""
+def _unseen_strengths(
+    problem: Problem, member: int, priors: Priors, others: Nuisance, after: Float[np.ndarray, "lane active amplitude"],
+    amplitudes: Float[np.ndarray, "lane amplitude"], spread: Float[np.ndarray, "lane amplitude amplitude"],
+    steps: Float[np.ndarray, "lane active"],
+) -> Float[np.ndarray, " lane"]:  # fmt: skip
+    """What unseen oscillators gain for being of any strength: their amplitude and their start together."""
     some = np.isin(np.nonzero(others.active)[0], _starts(problem, member))
     scales = np.append(
         priors.scales[problem.candidate(member).first],
         priors.precision_of(problem, (member,))[_starts(problem, member)] ** -0.5,
     )
-    cross = -after[some] @ spread
-    corner = others.inverse[np.ix_(some, some)] + after[some] @ spread @ after[some].T
-    joint = np.block([[spread, cross.T], [cross, corner]])
-    centre, lowest = np.append(amplitudes, step[some]), np.append(0.0, np.full(some.sum(), -np.inf))
-    return mixture_gain(centre / scales, joint / np.outer(scales, scales), np.zeros(len(centre), int), lowest)
+    follow = after[:, some]
+    cross = -follow @ spread
+    corner = others.inverse[np.ix_(some, some)] + follow @ spread @ follow.mT
+    joint = np.concatenate(
+        [np.concatenate([spread, cross.mT], axis=2), np.concatenate([cross, corner], axis=2)], axis=1
+    )
+    centre, lowest = np.concatenate([amplitudes, steps[:, some]], axis=1), np.append(0.0, np.full(some.sum(), -np.inf))
+    return mixture_gains(centre / scales, joint / np.outer(scales, scales), np.zeros(len(scales), int), lowest)
 
 
 def placed(problem, z, combination, larger, member, amplitudes, unit: Unit) -> np.ndarray:
