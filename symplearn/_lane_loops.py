@@ -167,6 +167,13 @@ def _by_machine(*operands: Any, beside: tuple[bool, ...], lanes: int, **p: Any) 
     return list(jax.ffi.ffi_call(name, _yielded(p, lanes))(*operands))
 
 
+def _beside_as_scan(*operands: Any, beside: tuple[bool, ...], lanes: int, **p: Any) -> list[Any]:
+    """The same as XLA has it, for what is compiled for another platform than this one."""
+    axes = tuple(one.ndim - 1 if own else None for one, own in zip(operands, beside, strict=True))
+    found = jax.vmap(lambda *some: _as_scan(*some, **p), axes, axis_size=lanes)(*operands)
+    return [jnp.moveaxis(one, 0, -1) for one in found]
+
+
 def _still_more(values: Sequence[Any], axes: Sequence[int | None], **p: Any) -> tuple[list[Any], list[int]]:
     """The loop of many times so many lanes: all beside each other."""
     size = next(value.shape[axis] for value, axis in zip(values, axes, strict=True) if axis is not None)
@@ -189,8 +196,8 @@ def _still_more(values: Sequence[Any], axes: Sequence[int | None], **p: Any) -> 
 
 
 def _alone(*values: Any, **p: Any) -> list[Any]:
-    """The loop of a single lane."""
-    name = _code_of(_Loop(p), (False,) * len(values), 1) if _is_wanted() else None
+    """The loop of a single lane, on a processor."""
+    name = None if _left_to_xla.get() else _code_of(_Loop(p), (False,) * len(values), 1)
     if name is None:
         return _as_scan(*values, **p)
     return [one[..., 0] for one in jax.ffi.ffi_call(name, _yielded(p, 1))(*values)]
@@ -266,7 +273,8 @@ _loop = Primitive("loop_of_lanes")
 _loop.multiple_results = True
 _loop.def_impl(_as_scan)
 _loop.def_abstract_eval(lambda *_, **p: _yielded(p))
-mlir.register_lowering(_loop, mlir.lower_fun(_alone, multiple_results=True))
+mlir.register_lowering(_loop, mlir.lower_fun(_as_scan, multiple_results=True))
+mlir.register_lowering(_loop, mlir.lower_fun(_alone, multiple_results=True), platform="cpu")
 batching.primitive_batchers[_loop] = _batched
 ad.primitive_jvps[_loop] = _with_slopes
 
@@ -274,5 +282,6 @@ _many = Primitive("loop_of_many_lanes")
 _many.multiple_results = True
 _many.def_impl(_by_machine)
 _many.def_abstract_eval(lambda *_, lanes, **p: _yielded(p, lanes))
-mlir.register_lowering(_many, mlir.lower_fun(_by_machine, multiple_results=True))
+mlir.register_lowering(_many, mlir.lower_fun(_beside_as_scan, multiple_results=True))
+mlir.register_lowering(_many, mlir.lower_fun(_by_machine, multiple_results=True), platform="cpu")
 batching.primitive_batchers[_many] = _still_more

@@ -13,6 +13,7 @@ _ARITHMETIC = set(
     """add add_any sub mul div neg abs sqrt rsqrt square integer_pow exp log sin cos tanh logistic pow max min
     log1p""".split()
 )
+_LOOPS = {"scan", "loop_of_lanes"}
 _SUMS = {"reduce_sum", "reduce_max", "reduce_min", "reduce_prod"}
 _FREE = set(
     """broadcast_in_dim reshape transpose concatenate slice dynamic_slice squeeze select_n iota eq ne lt le gt ge and or
@@ -36,7 +37,7 @@ def _cost(equation) -> int:
     inner = [part for part in jax.tree.leaves(equation.params, is_leaf=_is_program) if _is_program(part)]
     if inner:
         bodies = [_count(part.jaxpr if isinstance(part, ClosedJaxpr) else part) for part in inner]
-        return equation.params.get("length", 1) * sum(bodies) if name == "scan" else max(bodies)
+        return equation.params.get("length", 1) * sum(bodies) if name in _LOOPS else max(bodies)
     if name == "dot_general":
         (over, _), _ = equation.params["dimension_numbers"]
         terms = math.prod(equation.invars[0].aval.shape[axis] for axis in over)

@@ -212,3 +212,12 @@ def test_code_is_kept_beside_compiled_programs(cache_folder):
     (cache_folder / "file").write_text("")
     jax.config.update("jax_compilation_cache_dir", str(cache_folder / "file"))
     assert kept("a", b"4") == b"4"
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+def test_what_is_compiled_for_another_platform_is_xlas(mapped):
+    """A program for CUDA, which needs no GPU to be written, holds no call of machine code."""
+    function = with_lane_loops(LOOPS["slopes"])
+    x = jnp.asarray(lanes_of(9)) if mapped else jnp.asarray(POINT)
+    program = jax.export.export(jax.jit(jax.vmap(function) if mapped else function), platforms=["cuda"])(x)
+    assert "symplearn_lanes" not in program.mlir_module()
