@@ -54,6 +54,8 @@ from ._infer import infer as infer
 from ._information import Information as Information
 from ._information import information as information
 from ._inputs import Inputs as Inputs
+from ._lane_loops import CompiledLoop as CompiledLoop
+from ._lane_loops import loops_of as loops_of
 from ._learn import learn as learn
 from ._markov_estimators import full_information_markov as full_information_markov
 from ._markov_estimators import generalised_least_squares_markov as generalised_least_squares_markov

@@ -8,6 +8,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, TypeVar
 
@@ -15,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
@@ -27,6 +28,8 @@ from ._native import compiled
 _Told = TypeVar("_Told")
 # Numbers of an array that is written into a loop's function.
 _WRITTEN = 4096
+# Steps from which on a loop inside of one that is XLA's is worth a call of its own in each of that one's steps.
+_LONG = 64
 # Traced functions that are looked into for loops, and where they keep what they do; not those with slopes of their own.
 _CALLS = {"closed_call": "call_jaxpr", "jit": "jaxpr", "remat2": "jaxpr"}
 
@@ -94,6 +97,51 @@ def _moves(tangent: Any) -> bool:
     return type(tangent) is not SymbolicZero and tangent.dtype != jax.dtypes.float0
 
 
+@dataclass(frozen=True)
+class CompiledLoop:
+    """How one loop is compiled on a processor: how many `steps` it has, and `reason`, empty where it is machine code,
+    and else why it is left to XLA."""
+
+    steps: int
+    reason: str
+
+    def __str__(self) -> str:
+        return f"a loop of {self.steps} steps: " + (f"by XLA, for {self.reason}" if self.reason else "machine code")
+
+
+def loops_of(function: Callable[..., Any], *arguments: Any) -> tuple[CompiledLoop, ...]:
+    """How the loops of a function, as of a score or of its gradient, are compiled on a processor; not those inside of
+    other loops.
+
+    Filters have machine code where it can be written: arithmetic of double precision, loops, and branches; no sorting,
+    no random numbers, and no large matrices or networks, whose functions would be too long.
+    """
+    program = jax.make_jaxpr(with_lane_loops(function))(*arguments)
+    return tuple(CompiledLoop(one.params["length"], _reason(one.params)) for one in _loops(program.jaxpr))
+
+
+def _loops(program: Jaxpr) -> list[Any]:
+    """Loops of a traced function, and of those within it that are not loops themselves."""
+    found = []
+    for one in program.eqns:
+        if one.primitive is _loop:
+            found.append(one)
+            continue
+        parts = jax.tree.leaves(list(one.params.values()), is_leaf=lambda part: isinstance(part, ClosedJaxpr | Jaxpr))
+        inner = [part for part in parts if isinstance(part, ClosedJaxpr | Jaxpr)]
+        found += [each for part in inner for each in _loops(part.jaxpr if isinstance(part, ClosedJaxpr) else part)]
+    return found
+
+
+def _reason(p: Any) -> str:
+    """Why a loop cannot be written; empty where it can."""
+    try:
+        lane_loop(p, p["known"].arrays, (False,) * len(p["jaxpr"].in_avals), 1)
+    except Unsupported as error:
+        return str(error)
+    return ""
+
+
 def _evaluated(program: Jaxpr, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]:
     """What a traced function yields, with loops as operations of their own."""
     known = dict(zip([*program.constvars, *program.invars], [*consts, *args], strict=True))
@@ -128,11 +176,7 @@ def _bound(values: Sequence[Any], p: Any) -> list[Any]:
 
 def _has_loops(program: ClosedJaxpr | Jaxpr) -> bool:
     inner = program.jaxpr if isinstance(program, ClosedJaxpr) else program
-    return any(
-        one.primitive.name == "scan"
-        or (one.primitive.name in _CALLS and _has_loops(one.params[_CALLS[one.primitive.name]]))
-        for one in inner.eqns
-    )
+    return any(one.primitive.name == "scan" for one in _flat(inner))
 
 
 def _is_wanted() -> bool:
@@ -144,13 +188,34 @@ def _as_scan(*values: Any, known: Any, **p: Any) -> list[Any]:
     return jax.lax.scan_p.bind(*values, **p)
 
 
+def _in_parts(*values: Any, known: Any, **p: Any) -> list[Any]:
+    """The loop as XLA has it, with long loops inside of it as operations of their own: a filter's stretches."""
+    program = p["jaxpr"]
+    if any(one.primitive.name == "scan" and one.params["length"] >= _LONG for one in _flat(program.jaxpr)):
+        shapes = [jax.ShapeDtypeStruct(one.shape, one.dtype) for one in program.in_avals]
+
+        def body(*some: Any) -> list[Any]:
+            given = [known.arrays.get(k, one) for k, one in enumerate(some)]
+            return _evaluated(p["jaxpr"].jaxpr, p["jaxpr"].consts, given)
+
+        program = jax.make_jaxpr(body)(*shapes)
+    return _as_scan(*values, known=known, **{**p, "jaxpr": program})
+
+
+def _flat(program: Jaxpr) -> Iterator[JaxprEqn]:
+    """What a traced function does, and what those do that it calls."""
+    for one in program.eqns:
+        inner = one.params[_CALLS[one.primitive.name]] if one.primitive.name in _CALLS else None
+        yield from [one] if inner is None else _flat(inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner)
+
+
 def _batched(values: Sequence[Any], axes: Sequence[int | None], **p: Any) -> tuple[list[Any], list[int]]:
     """The loop of many lanes: by machine code where it can be written."""
     size = next(value.shape[axis] for value, axis in zip(values, axes, strict=True) if axis is not None)
     lanes = size + -size % width_for(size)
     name = _code_of(_Loop(p), tuple(axis is not None for axis in axes), lanes) if _is_wanted() else None
     if name is None:
-        found = jax.vmap(lambda *some: _as_scan(*some, **p), tuple(axes), axis_size=size)(*values)
+        found = jax.vmap(lambda *some: _in_parts(*some, **p), tuple(axes), axis_size=size)(*values)
         return found, [0] * len(found)
     operands = [value if axis is None else _filled(jnp.moveaxis(value, axis, -1), lanes)
                 for value, axis in zip(values, axes, strict=True)]  # fmt: skip
@@ -199,7 +264,7 @@ def _alone(*values: Any, **p: Any) -> list[Any]:
     """The loop of a single lane, on a processor."""
     name = None if _left_to_xla.get() else _code_of(_Loop(p), (False,) * len(values), 1)
     if name is None:
-        return _as_scan(*values, **p)
+        return _in_parts(*values, **p)
     return [one[..., 0] for one in jax.ffi.ffi_call(name, _yielded(p, 1))(*values)]
 
 
