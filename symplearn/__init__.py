@@ -8,6 +8,8 @@ from . import _loops as _loops  # isort: split
 
 from ._compare_samplers import Comparison as Comparison
 from ._compare_samplers import compare_samplers as compare_samplers
+from ._compiled_loops import CompiledLoop as CompiledLoop
+from ._compiled_loops import loops_of as loops_of
 from ._constrained_fit import ConstrainedEstimate as ConstrainedEstimate
 from ._constrained_fit import fit_constrained as fit_constrained
 from ._distributions import DoubleExponential as DoubleExponential
@@ -54,8 +56,6 @@ from ._infer import infer as infer
 from ._information import Information as Information
 from ._information import information as information
 from ._inputs import Inputs as Inputs
-from ._lane_loops import CompiledLoop as CompiledLoop
-from ._lane_loops import loops_of as loops_of
 from ._learn import learn as learn
 from ._markov_estimators import full_information_markov as full_information_markov
 from ._markov_estimators import generalised_least_squares_markov as generalised_least_squares_markov

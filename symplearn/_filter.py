@@ -18,8 +18,8 @@ from ._errors import InputError
 from ._faults import SENTENCES, Fault, is_fatal
 from ._filter_step import AbstractPassage, begin, measure, unscored
 from ._guard import guard
-from ._lane_loops import with_swift_slopes
 from ._model import AbstractAffine, AbstractStateSpaceModel, StateSpaceModel, slice_at
+from ._swift_slopes import with_swift_slopes
 from ._transforms import STANDARD, AbstractTransform, Moments, Taylor
 
 # Bytes of the states of all readings beyond which a gradient does not keep all of them, but takes a third longer.

@@ -1,27 +1,25 @@
-"""Loops over time that are machine code where a function is mapped over many lanes.
+"""Loops over time that are machine code: of one lane, or of many where a function is mapped over them.
 
-Of a filter's step XLA makes hundreds of small loops over all lanes, from memory to memory; machine code keeps eight
-lanes side by side in registers. What the code does not know, few lanes, and graphics cards, are XLA's.
+Of a filter's step XLA makes hundreds of small loops, from memory to memory; machine code keeps numbers in registers,
+and those of eight lanes side by side in one. What the code does not know, and graphics cards, are XLA's.
 """
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
 from functools import lru_cache
+from threading import Lock
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array
 
 from ._foreign_call import registered
-from ._machine_lanes import lane_loop, width_for
+from ._machine_lanes import filling, lane_loop
 from ._machine_rules import Unsupported
 from ._native import compiled
 
@@ -48,8 +46,8 @@ def left_to_xla() -> Iterator[None]:
 
 
 def with_lane_loops(function: Callable[..., _Told]) -> Callable[..., _Told]:
-    """The same function, whose loops are machine code under `jax.vmap`. Derivatives of it are XLA's: take
-    this of a gradient, not a gradient of this."""
+    """The same function, whose loops are machine code on a processor, under `jax.vmap` as well. Derivatives of it are
+    XLA's: take this of a gradient, not a gradient of this."""
 
     def looped(*args: Any) -> _Told:
         program, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
@@ -57,89 +55,6 @@ def with_lane_loops(function: Callable[..., _Told]) -> Callable[..., _Told]:
         return jax.tree.unflatten(jax.tree.structure(shapes), found)
 
     return looped
-
-
-def with_swift_slopes(function: Callable[..., Array]) -> Callable[..., Array]:
-    """The same function of arrays to a number, with loops that are machine code in its value and in its slopes.
-
-    Those are its reverse, whichever way it is differentiated, or, where it has none, XLA's.
-    """
-
-    @jax.custom_jvp
-    def swift(*args: Array) -> Array:
-        return with_lane_loops(function)(*args)
-
-    def rule(primals: Sequence[Array], tangents: Sequence[Any]) -> tuple[Array, Array]:
-        moved = [k for k, one in enumerate(tangents) if _moves(one)]
-        along = [tangents[k] for k in moved]
-
-        def of(*some: Array) -> Array:
-            all_of = dict(enumerate(primals)) | dict(zip(moved, some, strict=True))
-            return function(*(all_of[k] for k in range(len(primals))))
-
-        begin = [primals[k] for k in moved]
-        try:
-            value, slopes = with_lane_loops(jax.value_and_grad(of, range(len(moved))))(*begin)
-        except ValueError as error:
-            # A propagator with a loop of traced length has no reverse.
-            if "Reverse-mode differentiation" not in str(error):
-                raise
-            value, slope = jax.jvp(of, begin, along)
-            return value, slope
-        parts = [jnp.sum(slope * one) for slope, one in zip(slopes, along, strict=True)]
-        return value, sum(parts, jnp.zeros(()))
-
-    swift.defjvp(rule, symbolic_zeros=True)
-    return swift
-
-
-def _moves(tangent: Any) -> bool:
-    return type(tangent) is not SymbolicZero and tangent.dtype != jax.dtypes.float0
-
-
-@dataclass(frozen=True)
-class CompiledLoop:
-    """How one loop is compiled on a processor: how many `steps` it has, and `reason`, empty where it is machine code,
-    and else why it is left to XLA."""
-
-    steps: int
-    reason: str
-
-    def __str__(self) -> str:
-        return f"a loop of {self.steps} steps: " + (f"by XLA, for {self.reason}" if self.reason else "machine code")
-
-
-def loops_of(function: Callable[..., Any], *arguments: Any) -> tuple[CompiledLoop, ...]:
-    """How the loops of a function, as of a score or of its gradient, are compiled on a processor; not those inside of
-    other loops.
-
-    Filters have machine code where it can be written: arithmetic of double precision, loops, and branches; no sorting,
-    no random numbers, and no large matrices or networks, whose functions would be too long.
-    """
-    program = jax.make_jaxpr(with_lane_loops(function))(*arguments)
-    return tuple(CompiledLoop(one.params["length"], _reason(one.params)) for one in _loops(program.jaxpr))
-
-
-def _loops(program: Jaxpr) -> list[Any]:
-    """Loops of a traced function, and of those within it that are not loops themselves."""
-    found = []
-    for one in program.eqns:
-        if one.primitive is _loop:
-            found.append(one)
-            continue
-        parts = jax.tree.leaves(list(one.params.values()), is_leaf=lambda part: isinstance(part, ClosedJaxpr | Jaxpr))
-        inner = [part for part in parts if isinstance(part, ClosedJaxpr | Jaxpr)]
-        found += [each for part in inner for each in _loops(part.jaxpr if isinstance(part, ClosedJaxpr) else part)]
-    return found
-
-
-def _reason(p: Any) -> str:
-    """Why a loop cannot be written; empty where it can."""
-    try:
-        lane_loop(p, p["known"].arrays, (False,) * len(p["jaxpr"].in_avals), 1)
-    except Unsupported as error:
-        return str(error)
-    return ""
 
 
 def _evaluated(program: Jaxpr, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]:
@@ -171,7 +86,7 @@ def _bound(values: Sequence[Any], p: Any) -> list[Any]:
     for k, value in enumerate(values[: p["num_consts"]]):
         if not isinstance(value, jax.core.Tracer) and np.size(value) <= _WRITTEN:
             known[k] = np.asarray(value, inner.invars[k].aval.dtype)
-    return _loop.bind(*values, known=_Known(known), **p)
+    return loop.bind(*values, known=_Known(known), **p)
 
 
 def _has_loops(program: ClosedJaxpr | Jaxpr) -> bool:
@@ -212,7 +127,7 @@ def _flat(program: Jaxpr) -> Iterator[JaxprEqn]:
 def _batched(values: Sequence[Any], axes: Sequence[int | None], **p: Any) -> tuple[list[Any], list[int]]:
     """The loop of many lanes: by machine code where it can be written."""
     size = next(value.shape[axis] for value, axis in zip(values, axes, strict=True) if axis is not None)
-    lanes = size + -size % width_for(size)
+    lanes = filling(size)
     name = _code_of(_Loop(p), tuple(axis is not None for axis in axes), lanes) if _is_wanted() else None
     if name is None:
         found = jax.vmap(lambda *some: _in_parts(*some, **p), tuple(axes), axis_size=size)(*values)
@@ -310,7 +225,9 @@ class _Loop:
         return isinstance(other, _Loop) and self.p["jaxpr"] is other.p["jaxpr"] and self.key == other.key
 
 
+# What was written, by its name to XLA, which knows each once; threads may trace at the same time.
 _engines: dict[str, Any] = {}
+_lock = Lock()
 
 
 @lru_cache(maxsize=64)
@@ -322,9 +239,10 @@ def _code_of(loop: _Loop, beside: tuple[bool, ...], lanes: int) -> str | None:
         return None
     text = str(module)
     name = f"symplearn_lanes_{hashlib.sha256(text.encode()).hexdigest()[:24]}"
-    if name not in _engines:
-        _engines[name] = compiled(module)
-        registered(_engines[name].get_function_address("called"), name)
+    with _lock:
+        if name not in _engines:
+            _engines[name] = compiled(module)
+            registered(_engines[name].get_function_address("called"), name)
     return name
 
 
@@ -334,14 +252,14 @@ def _with_slopes(primals: Sequence[Any], slopes: Sequence[Any], **p: Any) -> Any
     return jax.jvp(lambda *values: _as_scan(*values, **p), tuple(primals), tuple(some))
 
 
-_loop = Primitive("loop_of_lanes")
-_loop.multiple_results = True
-_loop.def_impl(_as_scan)
-_loop.def_abstract_eval(lambda *_, **p: _yielded(p))
-mlir.register_lowering(_loop, mlir.lower_fun(_as_scan, multiple_results=True))
-mlir.register_lowering(_loop, mlir.lower_fun(_alone, multiple_results=True), platform="cpu")
-batching.primitive_batchers[_loop] = _batched
-ad.primitive_jvps[_loop] = _with_slopes
+loop = Primitive("loop_of_lanes")
+loop.multiple_results = True
+loop.def_impl(_as_scan)
+loop.def_abstract_eval(lambda *_, **p: _yielded(p))
+mlir.register_lowering(loop, mlir.lower_fun(_as_scan, multiple_results=True))
+mlir.register_lowering(loop, mlir.lower_fun(_alone, multiple_results=True), platform="cpu")
+batching.primitive_batchers[loop] = _batched
+ad.primitive_jvps[loop] = _with_slopes
 
 _many = Primitive("loop_of_many_lanes")
 _many.multiple_results = True

@@ -20,13 +20,15 @@ _MOST_GIVEN = 1024
 _BIT, _BYTE = ir.IntType(1), ir.IntType(8)
 
 
-def width_for(lanes: int) -> int:
-    """How many lanes of so many are put into one register: all of them, if it holds them."""
-    return next((width for width in WIDTHS if width >= lanes), WIDTHS[-1])
+def filling(lanes: int) -> int:
+    """How many lanes so many are filled up to, so that they fill registers: one that holds all, or several."""
+    width = next((width for width in WIDTHS if width >= lanes), WIDTHS[-1])
+    return lanes + -lanes % width
 
 
 def lane_loop(p: Any, known: Mapping[int, np.ndarray], beside: Sequence[bool], lanes: int) -> ir.Module:
-    """A module whose function `called` runs a loop of JAX, of parameters `p`, for so many lanes, which fill registers.
+    """A module whose function `called` runs a loop of JAX, of parameters `p`, for so many lanes, which had better fill
+    registers.
     The arguments that are known by their place are written into it.
 
     Of arguments that are `beside` each other in lanes, and of all results, the last axis is that of lanes.
@@ -106,7 +108,7 @@ class _Lanes:
         self.p, self.known, self.beside, self.lanes = p, known, beside, lanes
         self.arguments, self.results = function.args
         self.build = ir.IRBuilder(function.append_basic_block("entry"))
-        self.width = width_for(lanes)
+        self.width = max(width for width in WIDTHS if lanes % width == 0)
         self.code = _LaneCode(self.build, self.width, beside=True, most=_MOST[self.width])
 
     def write(self) -> None:

@@ -111,6 +111,22 @@ def test_loops_are_those_of_xla(name, number, monkeypatch):
     check(LOOPS[name], number, monkeypatch)
 
 
+@pytest.mark.parametrize(("outer", "inner"), [(5, 1), (3, 2), (2, 7), (3, 8)])
+def test_lanes_of_lanes_are_beside_each_other(outer, inner, monkeypatch):
+    """A function that is mapped twice, over numbers of lanes that fill no register."""
+    names, x = counted(monkeypatch), jnp.asarray(lanes_of(outer * inner)).reshape(outer, inner, 3)
+    y = jnp.linspace(0.5, 1.5, outer)
+
+    def function(x, y):
+        return lax.scan(lambda c, row: (jnp.sin(c * row[0]) + y * x, c[1]), x, TABLE)
+
+    def twice(one):
+        return jax.jit(jax.vmap(jax.vmap(one, (0, None))))
+
+    same(twice(with_lane_loops(function))(x, y), twice(function)(x, y))
+    assert names and None not in names
+
+
 @pytest.mark.parametrize(
     "step",
     [lambda c, row: (jnp.sort(c), None), lambda c, row: (lax.while_loop(lambda d: d[0] < 1, lambda d: d + 1, c), None),
