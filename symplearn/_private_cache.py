@@ -1,16 +1,26 @@
-"""Double precision, and what a process of the command line keeps in the user's cache folder."""
+"""Double precision, a garbage collector for much that stays, and what a process of the command line keeps in the
+user's cache folder."""
 
 import atexit
+import gc
 import os
 import shutil
 import tempfile
 from pathlib import Path
 
 
+# New objects between two collections, and how many of those between two of older objects.
+_COLLECTED = 200_000, 20, 50
+
+
 def prepare(cache: bool) -> None:
     """Double precision; compiled programs and the plots' font list in a private folder of the user's cache."""
     import jax
 
+    # Expressions and traced functions are hundreds of thousands of objects that stay: to look through them again and
+    # again took a twentieth of a diagnosis.
+    gc.freeze()
+    gc.set_threshold(*_COLLECTED)
     jax.config.update("jax_enable_x64", True)
     folder = _private_folder() if cache else None
     # Left to itself matplotlib keeps its font list in a folder of its own.
