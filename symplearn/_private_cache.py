@@ -8,7 +8,6 @@ import shutil
 import tempfile
 from pathlib import Path
 
-
 # New objects between two collections, and how many of those between two of older objects.
 _COLLECTED = 200_000, 20, 50
 
