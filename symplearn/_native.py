@@ -13,6 +13,8 @@ import llvmlite
 import llvmlite.binding as llvm
 from llvmlite import ir
 
+_DIGEST = hashlib.sha256().digest_size
+
 
 def compiled(module: ir.Module) -> Any:
     """The engine that holds the machine code of a module."""
@@ -41,11 +43,13 @@ def _kept(text: str, make: Callable[[], bytes]) -> bytes:
     of = "\0".join((text, llvmlite.__version__, llvm.get_host_cpu_name(), _features()))
     path = Path(folder, f"symplearn-{hashlib.sha256(of.encode()).hexdigest()}.o")
     with contextlib.suppress(OSError):
-        return path.read_bytes()
+        digest, code = (kept := path.read_bytes())[:_DIGEST], kept[_DIGEST:]
+        if digest == hashlib.sha256(code).digest():  # a damaged file would end the process
+            return code
     code, unfinished = make(), path.with_name(f".{path.name}.{os.getpid()}")
     with contextlib.suppress(OSError):  # a cache that cannot be written is none
         path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished.write_bytes(code)
+        unfinished.write_bytes(hashlib.sha256(code).digest() + code)
         os.replace(unfinished, path)
     return code
 

@@ -114,7 +114,7 @@ def test_a_function_with_its_own_derivative_keeps_it():
 
     mine.defjvp(lambda values, slopes: (mine(*values), 7.0 * slopes[0] + 3.0 * values[0] * slopes[1]))
     check(lambda x: jnp.stack([mine(x[0], x[1]), mine(x[2], 2.0), mine(2.0, x[1])]))
-    # One product: round-off.
+    # One product, rounded once by both: the last digit at most.
     assert run(lambda x: mine(x[:1], 1.0), jnp.asarray(POINT))[1][0] == pytest.approx(7.0 * DIRECTIONS[0], rel=1e-15)
 
 
