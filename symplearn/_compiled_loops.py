@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
-from jax.extend.core import ClosedJaxpr, Jaxpr
+from jax.extend.core import Jaxpr, JaxprEqn
 
 from ._lane_loops import loop, with_lane_loops
+from ._machine_arithmetic import Unsupported
+from ._machine_flow import programs_in
 from ._machine_lanes import lane_loop
-from ._machine_rules import Unsupported
 
 
 @dataclass(frozen=True)
@@ -35,16 +36,11 @@ def loops_of(function: Callable[..., Any], *arguments: Any) -> tuple[CompiledLoo
     return tuple(CompiledLoop(one.params["length"], _reason(one.params)) for one in _loops(program.jaxpr))
 
 
-def _loops(program: Jaxpr) -> list[Any]:
+def _loops(program: Jaxpr) -> list[JaxprEqn]:
     """Loops of a traced function, and of those within it that are not loops themselves."""
     found = []
     for one in program.eqns:
-        if one.primitive is loop:
-            found.append(one)
-            continue
-        parts = jax.tree.leaves(list(one.params.values()), is_leaf=lambda part: isinstance(part, ClosedJaxpr | Jaxpr))
-        inner = [part for part in parts if isinstance(part, ClosedJaxpr | Jaxpr)]
-        found += [each for part in inner for each in _loops(part.jaxpr if isinstance(part, ClosedJaxpr) else part)]
+        found += [one] if one.primitive is loop else [each for part in programs_in(one) for each in _loops(part)]
     return found
 
 

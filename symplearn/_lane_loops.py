@@ -19,8 +19,8 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
 
 from ._foreign_call import registered
+from ._machine_arithmetic import Unsupported
 from ._machine_lanes import filling, lane_loop
-from ._machine_rules import Unsupported
 from ._native import compiled
 
 _Told = TypeVar("_Told")

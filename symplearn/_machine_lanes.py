@@ -7,8 +7,10 @@ import numpy as np
 from llvmlite import ir
 
 from ._foreign_call import POINTERS, handler, numbers
-from ._machine_code import Cells, Code, Table, looped
-from ._machine_rules import INTEGER, Dual, Unsupported, type_of
+from ._machine_arithmetic import BIT, INTEGER, SHORT, Dual, Unsupported, type_of
+from ._machine_code import Code
+from ._machine_flow import counted, looped
+from ._machine_memory import AbstractCode, AbstractTable, Cells
 
 # How many lanes one register may have.
 WIDTHS = (1, 4, 8)
@@ -17,7 +19,7 @@ WIDTHS = (1, 4, 8)
 _MOST = {1: 20_000, 4: 40_000, 8: 40_000}
 # Numbers that every step of a loop is given beside those that change.
 _MOST_GIVEN = 1024
-_BIT, _BYTE = ir.IntType(1), ir.IntType(8)
+_BYTE = ir.IntType(8)
 
 
 def filling(lanes: int) -> int:
@@ -39,63 +41,37 @@ def lane_loop(p: Any, known: Mapping[int, np.ndarray], beside: Sequence[bool], l
     return module
 
 
-class _Stream(Table):
+class _Stream(AbstractTable):
     """A table of XLA: numbers of one lane after those of the other, or the same for all."""
 
     def __init__(self, pointer: ir.Value, shape: tuple[int, ...], dtype: Any, lanes: int | None, first: ir.Value):
-        super().__init__(pointer, shape)
-        self.kind, self.lanes, self.first = type_of(dtype), lanes, first
+        self.pointer, self.shape, self.kind, self.lanes, self.first = pointer, shape, type_of(dtype), lanes, first
 
-
-class _LaneCode(Code):
-    """Code that reads and writes XLA's tables."""
-
-    def row(self, table: Table, place: ir.Value) -> np.ndarray:
-        if not isinstance(table, _Stream):
-            return super().row(table, place)
-        out = np.empty(table.shape[1:], object)
-        for k, at in enumerate(np.ndindex(out.shape)):
-            out[at] = Dual(self.read(table, self._entry(place, out.size, k)))
-        return out
-
-    def set_row(self, table: Table, place: ir.Value, values: np.ndarray) -> None:
-        if not isinstance(table, _Stream):
-            super().set_row(table, place, values)
-            return
-        for k, entry in enumerate(values.ravel()):
-            self.write(table, self._entry(place, values.size, k), entry.value)
-
-    def _entry(self, place: ir.Value, size: int, k: int) -> ir.Value:
-        build = self.builder
-        return build.add(build.mul(place, ir.Constant(INTEGER, size)), ir.Constant(INTEGER, k))
-
-    def read(self, stream: _Stream, entry: ir.Value) -> ir.Value:
-        """One number, of every lane."""
-        build = self.builder
-        found = build.load(self._at(stream, entry), align=self._aligned(stream))
-        if stream.kind != _BIT:
+    def read(self, code: AbstractCode, entry: ir.Value) -> ir.Value:
+        found = code.builder.load(self._at(code, entry), align=self._aligned)
+        if self.kind != BIT:
             return found
-        return build.icmp_unsigned(
-            "!=", found, ir.Constant(found.type, None if isinstance(found.type, ir.VectorType) else 0)
-        )
+        nothing = ir.Constant(found.type, None if isinstance(found.type, ir.VectorType) else 0)
+        return code.builder.icmp_unsigned("!=", found, nothing)
 
-    def write(self, stream: _Stream, entry: ir.Value, value: ir.Value) -> None:
-        """Write one number of every lane."""
-        wide = self.wide(value)
-        if stream.kind == _BIT:
-            wide = self.builder.zext(wide, self.register_of(_BYTE))
-        self.builder.store(wide, self._at(stream, entry), align=self._aligned(stream))
+    def write(self, code: AbstractCode, entry: ir.Value, value: ir.Value) -> None:
+        wide = code.wide(value)
+        if self.kind == BIT:
+            wide = code.builder.zext(wide, code.register_of(_BYTE))
+        code.builder.store(wide, self._at(code, entry), align=self._aligned)
 
-    def _aligned(self, stream: _Stream) -> int:
-        return 1 if stream.kind == _BIT else 4 if stream.kind == ir.IntType(32) else 8
+    @property
+    def _aligned(self) -> int:
+        """Bytes at whose multiples numbers lie: their own."""
+        return 1 if self.kind == BIT else 4 if self.kind == SHORT else 8
 
-    def _at(self, stream: _Stream, entry: ir.Value) -> ir.Value:
-        build = self.builder
-        if stream.lanes is None:
-            return build.gep(stream.pointer, [entry])
-        entry = build.add(build.mul(entry, ir.Constant(INTEGER, stream.lanes)), stream.first)
-        kind = _BYTE if stream.kind == _BIT else stream.kind
-        return build.bitcast(build.gep(stream.pointer, [entry]), self.register_of(kind).as_pointer())
+    def _at(self, code: AbstractCode, entry: ir.Value) -> ir.Value:
+        build = code.builder
+        if self.lanes is None:
+            return build.gep(self.pointer, [entry])
+        entry = build.add(build.mul(entry, ir.Constant(INTEGER, self.lanes)), self.first)
+        kind = _BYTE if self.kind == BIT else self.kind
+        return build.bitcast(build.gep(self.pointer, [entry]), code.register_of(kind).as_pointer())
 
 
 class _Lanes:
@@ -108,24 +84,12 @@ class _Lanes:
         self.arguments, self.results = function.args
         self.build = ir.IRBuilder(function.append_basic_block("entry"))
         self.width = max(width for width in WIDTHS if lanes % width == 0)
-        self.code = _LaneCode(self.build, self.width, beside=True, most=_MOST[self.width])
+        self.code = Code(self.build, self.width, beside=True, most=_MOST[self.width])
 
     def write(self) -> None:
-        build = self.build
-        with build.goto_entry_block():
-            count = build.alloca(INTEGER)
-        build.store(ir.Constant(INTEGER, 0), count)
-        again, inside, end = map(build.append_basic_block, ("lanes", "some", "done"))
-        build.branch(again)
-        build.position_at_end(again)
-        first = build.load(count)
-        build.cbranch(build.icmp_signed("<", first, ir.Constant(INTEGER, self.lanes)), inside, end)
-        build.position_at_end(inside)
-        self._some(first)
-        build.store(build.add(first, ir.Constant(INTEGER, self.width)), count)
-        build.branch(again)
-        build.position_at_end(end)
-        build.ret_void()
+        with counted(self.build, ir.Constant(INTEGER, self.lanes), self.width) as first:
+            self._some(first)
+        self.build.ret_void()
 
     def _some(self, first: ir.Value) -> None:
         """The loop over time of the lanes from `first` on."""
@@ -142,12 +106,12 @@ class _Lanes:
         looped(self.code, p, values[:given], cells, streams[last:], rooms[p["num_carry"] :])
         for room, array in zip(rooms[: p["num_carry"]], cells.load(), strict=True):
             for k, entry in enumerate(array.ravel()):
-                self.code.write(room, ir.Constant(INTEGER, k), entry.value)
+                room.write(self.code, ir.Constant(INTEGER, k), entry.value)
 
     def _stream(self, buffers: ir.Value, k: int, atom: Any, along: bool, lanes: int | None, first: ir.Value) -> _Stream:
         shape, dtype = atom.aval.shape, atom.aval.dtype
         kind = type_of(dtype)
-        pointer = numbers(self.build, buffers, k, _BYTE if kind == _BIT else kind)
+        pointer = numbers(self.build, buffers, k, _BYTE if kind == BIT else kind)
         return _Stream(pointer, (self.p["length"], *shape) if along else shape, dtype, lanes, first)
 
     def _all(self, stream: _Stream) -> np.ndarray:
@@ -156,5 +120,5 @@ class _Lanes:
         if out.size > _MOST_GIVEN:
             raise Unsupported("many numbers that are given to every step")
         for k, at in enumerate(np.ndindex(out.shape)):
-            out[at] = Dual(self.code.read(stream, ir.Constant(INTEGER, k)))
+            out[at] = Dual(stream.read(self.code, ir.Constant(INTEGER, k)))
         return out

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from ._machine_rules import RULES, Arithmetic, Dual, Unsupported, known
+from ._machine_arithmetic import Arithmetic, Dual, Unsupported, known
+from ._machine_rules import RULES
 
 _Place = Callable[[Arithmetic, JaxprEqn, list[np.ndarray]], list[np.ndarray]]
 

@@ -10,8 +10,9 @@ from jax import lax
 from llvmlite import ir
 from machine_operations import OF_ONE, POINT
 
+from symplearn._machine_arithmetic import DOUBLE, Dual, Unsupported
 from symplearn._machine_code import Code
-from symplearn._machine_rules import DOUBLE, RULES, Dual, Unsupported
+from symplearn._machine_rules import RULES
 from symplearn._native import compiled
 from symplearn.diagnosis._row_loop import _array
 

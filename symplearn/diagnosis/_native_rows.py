@@ -18,7 +18,7 @@ import integrators as ig
 from .._augmented import Equations
 from .._augmented_flow import SimulatedFlow, SimulatedReading, Span
 from .._augmented_system import Switches
-from .._machine_rules import Unsupported
+from .._machine_arithmetic import Unsupported
 from .._native import compiled
 from ._course import Course
 from ._row_loop import MANY, POINTERS, row_loop

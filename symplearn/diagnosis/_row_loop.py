@@ -7,8 +7,10 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 from llvmlite import ir
 
-from .._machine_code import Cells, Code, Table
-from .._machine_rules import DOUBLE, INTEGER, Dual
+from .._machine_arithmetic import DOUBLE, INTEGER, Dual
+from .._machine_code import Code
+from .._machine_flow import counted
+from .._machine_memory import Cells, Table
 
 WIDTH = 8  # directions in one register
 # Rows of a table whose number is not known when its code is written; they are never counted.
@@ -60,25 +62,14 @@ class _Rows:
         x, *numbers = np.split(_array(taken), np.cumsum(self.sizes[:2]))
         arrived, begun = Cells(self.code, phase_point), Cells(self.code, phase_point)
         arrived.store([x])
-        with build.goto_entry_block():
-            count = build.alloca(INTEGER)
-        build.store(_place(0), count)
-        again, inside, end = map(build.append_basic_block, ("rows", "row", "done"))
-        build.branch(again)
-        build.position_at_end(again)
-        k = build.load(count)
-        build.cbranch(build.icmp_signed("<", k, self.rows), inside, end)
-        build.position_at_end(inside)
-        now = arrived.load()
-        begun.store(now)
-        self.on_the_path(k, x, begun)
-        given = [*begun.load(), *numbers, *self.given(k), *(_array([bit]).reshape(()) for bit in self.on)]
-        seen, after = self.code.evaluated(self.program, given)
-        self.told(k, [*seen, *now[0]])
-        arrived.store([after])
-        build.store(build.add(k, _place(1)), count)
-        build.branch(again)
-        build.position_at_end(end)
+        with counted(build, self.rows) as k:
+            now = arrived.load()
+            begun.store(now)
+            self.on_the_path(k, x, begun)
+            given = [*begun.load(), *numbers, *self.given(k), *(_array([bit]).reshape(()) for bit in self.on)]
+            seen, after = self.code.evaluated(self.program, given)
+            self.told(k, [*seen, *now[0]])
+            arrived.store([after])
         build.ret_void()
 
     def entry(self, array: ir.Value, place: ir.Value) -> ir.Value:
