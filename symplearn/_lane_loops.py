@@ -72,11 +72,26 @@ def _evaluated(program: Jaxpr, consts: Sequence[Any], args: Sequence[Any]) -> li
             inner = one.params[_CALLS[name]]
             closed = isinstance(inner, ClosedJaxpr)
             found = _evaluated(inner.jaxpr if closed else inner, inner.consts if closed else (), values)
+        elif _tells_places(one, values):
+            with jax.ensure_compile_time_eval():
+                found = _plainly(one, values)
         else:
-            found = one.primitive.bind(*values, **one.primitive.get_bind_params(one.params))
-            found = found if one.primitive.multiple_results else [found]
+            found = _plainly(one, values)
         known.update(zip(one.outvars, found, strict=True))
     return [value(atom) for atom in program.outvars]
+
+
+def _plainly(one: JaxprEqn, values: Sequence[Any]) -> list[Any]:
+    """What an operation yields."""
+    found = one.primitive.bind(*values, **one.primitive.get_bind_params(one.params))
+    return list(found) if one.primitive.multiple_results else [found]
+
+
+def _tells_places(one: JaxprEqn, values: Sequence[Any]) -> bool:
+    """Whether an operation yields a few integers that follow from what is known: places in arrays."""
+    yielded: list[Any] = [atom.aval for atom in one.outvars]
+    few = all(str(aval.dtype) in ("bool", "int32", "int64") and aval.size <= _WRITTEN for aval in yielded)
+    return few and not one.effects and not any(isinstance(value, jax.core.Tracer) for value in values)
 
 
 def _bound(values: Sequence[Any], p: Any) -> list[Any]:

@@ -45,14 +45,43 @@ def _padded(on: Arithmetic, one: JaxprEqn, values: list[np.ndarray]) -> list[np.
 
 
 def _picked(on: Arithmetic, one: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
-    """Single entries at places that are known."""
+    """Single entries, or rows, at places that are known."""
     (array, places), p = values, one.params
-    axes, found = p["dimension_numbers"].start_index_map, [known(place) for place in places.ravel()]
-    plain = set(p["slice_sizes"]) == {1} and not p["dimension_numbers"].offset_dims and len(axes) == array.ndim
-    if not plain or None in found:
+    axes, offsets = p["dimension_numbers"].start_index_map, p["dimension_numbers"].offset_dims
+    where = _known_places(places)
+    if set(p["slice_sizes"]) == {1} and not offsets and len(axes) == array.ndim:
+        return [array[tuple(where[axes.index(axis)] for axis in range(array.ndim))]]
+    if axes == (0,) and p["slice_sizes"] == (1, *array.shape[1:]) and offsets == _last(array.ndim - 1, places.ndim - 1):
+        return [array[where[0]]]
+    raise Unsupported("parts of an array, in an order of their own")
+
+
+def _added(on: Arithmetic, one: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
+    """Single entries of a vector, or rows, added to at places that are known."""
+    (array, places, more), numbers = values, one.params["dimension_numbers"]
+    rows = _last(array.ndim - 1, places.ndim - 1)
+    if numbers.scatter_dims_to_operand_dims != (0,) or numbers.inserted_window_dims != (0,):
+        raise Unsupported("an array that is added to in parts of several axes")
+    if numbers.update_window_dims != rows or places.shape[-1] != 1:
+        raise Unsupported("an array that is added to in an order of its own")
+    out = array.copy()
+    for place, at in zip(_known_places(places)[0].ravel(), np.ndindex(places.shape[:-1]), strict=True):
+        for k in np.ndindex(array.shape[1:]):
+            out[(place, *k)] = RULES["add"](on, {}, out[(place, *k)], more[(*at, *k)])
+    return [out]
+
+
+def _last(number: int, after: int) -> tuple[int, ...]:
+    """So many axes after others."""
+    return tuple(range(after, after + number))
+
+
+def _known_places(places: np.ndarray) -> np.ndarray:
+    """Places as numbers, those of every axis along the first."""
+    found = [known(place) for place in places.ravel()]
+    if None in found:
         raise Unsupported("entries at places that are not known")
-    where = np.moveaxis(np.array(found, int).reshape(places.shape), -1, 0)
-    return [array[tuple(where[axes.index(axis)] for axis in range(array.ndim))]]
+    return np.moveaxis(np.array(found, int).reshape(places.shape), -1, 0)
 
 
 def _counted(on: Any, one: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
@@ -119,6 +148,7 @@ PLACED: dict[str, _Place] = {
     "reduce_sum": _reduced("add"),
     "reshape": _moved(lambda array, p: array.reshape(p["new_sizes"])),
     "rev": _moved(lambda array, p: np.flip(array, p["dimensions"])),
+    "scatter-add": _added,
     "slice": _moved(_cut),
     "small_product": _product,
     "split": lambda on, one, values: np.split(values[0], np.cumsum(one.params["sizes"])[:-1], one.params["axis"]),

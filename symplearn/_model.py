@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 import integrators as ig
@@ -160,10 +161,11 @@ class Coordinates(AbstractAffine):
     indices: tuple[int, ...] = eqx.field(static=True)
 
     def slope(self, x: Float[Array, " state"]) -> Float[Array, "channel state"]:
-        return jnp.eye(x.shape[0])[jnp.asarray(self.indices)]
+        return jnp.eye(x.shape[0])[np.asarray(self.indices)]
 
     def __call__(self, x: Float[Array, " state"], context: Any = None) -> Float[Array, " channel"]:
-        return x[jnp.asarray(self.indices)]
+        # Known places, which a machine's registers need.
+        return x[np.asarray(self.indices)]
 
 
 class LinearObservation(AbstractAffine):

@@ -7,6 +7,7 @@ import pytest
 from jax import lax
 from machine_operations import OF_ONE, POINT
 
+import integrators as ig
 import symplearn as sl
 from benchmarks._cases import cherry, henon_heiles
 from symplearn import _filter, _lane_loops, _native
@@ -93,6 +94,13 @@ LOOPS = {
     "step by step": lambda x: lax.scan(
         lambda c, row: (lax.fori_loop(0, 3, lambda k, d: turned(d, k, row[0]), c), row[0] * c[0]), x, TABLE
     ),
+    "rows": lambda x: lax.scan(
+        lambda c, row: (jnp.outer(c, c)[np.array([2, 0, 0])][:, 1] * row[0], jnp.outer(c, row)[np.array([1, 2])].sum()),
+        x, TABLE,
+    ),
+    "added to": lambda x: jax.grad(
+        lambda y: lax.scan(lambda c, row: (jnp.sin(c[np.array([1, 2, 1])]) * row[0] + y, None), y, TABLE)[0].sum()
+    )(x),
     "at their ends": lambda x: lax.scan(
         lambda c, row: (lax.pad(c, row[0], [(-1, 1, 0)]) + lax.pad(c[:2], 0.0, [(0, 0, 1)]), jnp.any(c > 0)), x, TABLE
     ),
@@ -228,6 +236,30 @@ def cache_folder(tmp_path):
     jax.config.update("jax_compilation_cache_dir", str(tmp_path / "kept"))
     yield tmp_path / "kept"
     jax.config.update("jax_compilation_cache_dir", usual)
+
+
+def test_a_model_of_ones_own_that_reads_one_coordinate_is_written():
+    """The filter of a Hamiltonian that a user wrote, where one coordinate is read, is machine code there and back."""
+
+    class Pendulum(ig.AbstractSeparableHamiltonian):
+        gravity: jax.Array
+
+        def kinetic(self, p):
+            return 0.5 * p @ p
+
+        def potential(self, q):
+            return -self.gravity * jnp.sum(jnp.cos(q))
+
+    noise = sl.AdditiveGaussian(sl.ScaledIdentity(0.01, 2)), sl.AdditiveGaussian(sl.ScaledIdentity(0.01, 1))
+    start, recording = sl.Gaussian(jnp.ones(2), jnp.eye(2)), sl.TimeSeries(0.2 * np.arange(60), jnp.ones((60, 1)))
+
+    def score(gravity):
+        dynamics = sl.Propagator(Pendulum(gravity), ig.Leapfrog(), substeps=4)
+        model = sl.StateSpaceModel(dynamics, sl.Coordinates((0,)), *noise, start)
+        return sl.MarginalLikelihood().score(model, recording)
+
+    there_and_back = sl.loops_of(jax.value_and_grad(score), jnp.asarray(9.0))
+    assert [one.reason for one in there_and_back if one.steps == 60] == ["", ""]
 
 
 def test_how_loops_are_compiled_is_told():
