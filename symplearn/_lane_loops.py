@@ -4,12 +4,9 @@ Of a filter's step XLA makes hundreds of small loops, from memory to memory; mac
 and those of eight lanes side by side in one. What the code does not know, and graphics cards, are XLA's.
 """
 
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import lru_cache
-from threading import Lock
 from typing import Any, TypeVar
 
 import jax
@@ -18,10 +15,8 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
 
-from ._foreign_call import registered
-from ._machine_arithmetic import Unsupported
-from ._machine_lanes import filling, lane_loop
-from ._native import compiled
+from ._lane_code import Known, Loop, code_of
+from ._machine_lanes import filling
 
 _Told = TypeVar("_Told")
 # Numbers of an array that is written into a loop's function.
@@ -101,7 +96,7 @@ def _bound(values: Sequence[Any], p: Any) -> list[Any]:
     for k, value in enumerate(values[: p["num_consts"]]):
         if not isinstance(value, jax.core.Tracer) and np.size(value) <= _WRITTEN:
             known[k] = np.asarray(value, inner.invars[k].aval.dtype)
-    return loop.bind(*values, known=_Known(known), **p)
+    return loop.bind(*values, known=Known(known), **p)
 
 
 def _has_loops(program: ClosedJaxpr | Jaxpr) -> bool:
@@ -143,7 +138,7 @@ def _batched(values: Sequence[Any], axes: Sequence[int | None], **p: Any) -> tup
     """The loop of many lanes: by machine code where it can be written."""
     size = next(value.shape[axis] for value, axis in zip(values, axes, strict=True) if axis is not None)
     lanes = filling(size)
-    name = _code_of(_Loop(p), tuple(axis is not None for axis in axes), lanes) if _is_wanted() else None
+    name = code_of(Loop(p), tuple(axis is not None for axis in axes), lanes) if _is_wanted() else None
     if name is None:
         found = jax.vmap(lambda *some: _in_parts(*some, **p), tuple(axes), axis_size=size)(*values)
         return found, [0] * len(found)
@@ -157,7 +152,7 @@ def _batched(values: Sequence[Any], axes: Sequence[int | None], **p: Any) -> tup
 def _by_machine(*operands: Any, beside: tuple[bool, ...], lanes: int, **p: Any) -> list[Any]:
     """The loop of so many lanes, which is known to be written; those of operands that are `beside` each other are their
     last axis."""
-    name = _code_of(_Loop(p), beside, lanes)
+    name = code_of(Loop(p), beside, lanes)
     assert name is not None
     return list(jax.ffi.ffi_call(name, _yielded(p, lanes))(*operands))
 
@@ -192,7 +187,7 @@ def _still_more(values: Sequence[Any], axes: Sequence[int | None], **p: Any) -> 
 
 def _alone(*values: Any, **p: Any) -> list[Any]:
     """The loop of a single lane, on a processor."""
-    name = None if _left_to_xla.get() else _code_of(_Loop(p), (False,) * len(values), 1)
+    name = None if _left_to_xla.get() else code_of(Loop(p), (False,) * len(values), 1)
     if name is None:
         return _in_parts(*values, **p)
     return [one[..., 0] for one in jax.ffi.ffi_call(name, _yielded(p, 1))(*values)]
@@ -211,54 +206,6 @@ def _yielded(p: Any, *lanes: int) -> list[Any]:
         along = () if k < p["num_carry"] else (p["length"],)
         out.append(jax.core.ShapedArray((*along, *aval.shape, *lanes), aval.dtype))
     return out
-
-
-class _Known:
-    """Arrays by their place among what a loop is given; two of the same numbers are the same."""
-
-    def __init__(self, arrays: dict[int, np.ndarray]):
-        self.arrays = arrays
-        self.key = tuple((k, one.shape, str(one.dtype), one.tobytes()) for k, one in arrays.items())
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Known) and self.key == other.key
-
-
-class _Loop:
-    """A loop's parameters, to be found again by the traced function that it repeats."""
-
-    def __init__(self, p: Any):
-        self.p, self.key = p, tuple(p[name] for name in ("length", "reverse", "num_consts", "num_carry", "known"))
-
-    def __hash__(self) -> int:
-        return hash((id(self.p["jaxpr"]), self.key))
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Loop) and self.p["jaxpr"] is other.p["jaxpr"] and self.key == other.key
-
-
-# What was written, by its name to XLA, which knows each once; threads may trace at the same time.
-_engines: dict[str, Any] = {}
-_lock = Lock()
-
-
-@lru_cache(maxsize=64)
-def _code_of(loop: _Loop, beside: tuple[bool, ...], lanes: int) -> str | None:
-    """The name by which XLA knows a loop's machine code; None where there is none."""
-    try:
-        module = lane_loop(loop.p, loop.p["known"].arrays, beside, lanes)
-    except Unsupported:
-        return None
-    text = str(module)
-    name = f"symplearn_lanes_{hashlib.sha256(text.encode()).hexdigest()[:24]}"
-    with _lock:
-        if name not in _engines:
-            _engines[name] = compiled(module)
-            registered(_engines[name].get_function_address("called"), name)
-    return name
 
 
 def _with_slopes(primals: Sequence[Any], slopes: Sequence[Any], **p: Any) -> Any:

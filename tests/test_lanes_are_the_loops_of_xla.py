@@ -31,8 +31,8 @@ def lanes_of(number, size=3, seed=0):
 
 def counted(monkeypatch):
     """The names by which loops are known to XLA, as they are written; None where one cannot be."""
-    names, write = [], _lane_loops._code_of
-    monkeypatch.setattr(_lane_loops, "_code_of", lambda *args: names.append(write(*args)) or names[-1])
+    names, write = [], _lane_loops.code_of
+    monkeypatch.setattr(_lane_loops, "code_of", lambda *args: names.append(write(*args)) or names[-1])
     return names
 
 
