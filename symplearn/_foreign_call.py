@@ -13,6 +13,7 @@ from llvmlite import ir
 _EXTENSION, _ARGUMENTS, _RESULTS = 8, 72, 112
 _KIND, _METADATA, _MAJOR, _MINOR, _TRAITS, _STATE = 8, 24, 24, 28, 32, 40
 _DATA = 24
+_REGISTER = 64
 # The kind of an extension that asks for the version of the interface.
 _ASKS = 1
 _BYTE, _SHORT, _LONG = ir.IntType(8), ir.IntType(32), ir.IntType(64)
@@ -37,6 +38,20 @@ def handler(module: ir.Module, work: ir.Function) -> None:
             build.ret(nothing)
     build.call(work, [_loaded(build, frame, at, POINTERS) for at in (_ARGUMENTS, _RESULTS)])
     build.ret(nothing)
+
+
+def with_memory(work: ir.Function, inside: ir.Function, size: int) -> None:
+    """Let `work` call another function of the same arguments with memory for so many real numbers besides."""
+    module, build, real = work.module, ir.IRBuilder(work.append_basic_block("entry")), ir.DoubleType()
+    make = ir.Function(module, ir.FunctionType(POINTER, [_LONG]), "malloc")
+    drop = ir.Function(module, ir.FunctionType(ir.VoidType(), [POINTER]), "free")
+    # One register more in front, so as to begin at its multiple, and one behind, which is read beyond the last row.
+    found = build.call(make, [ir.Constant(_LONG, 8 * size + 2 * _REGISTER)])
+    place = build.add(build.ptrtoint(found, _LONG), ir.Constant(_LONG, _REGISTER - 1))
+    begin = build.inttoptr(build.and_(place, ir.Constant(_LONG, -_REGISTER)), real.as_pointer())
+    build.call(inside, [*work.args, begin])
+    build.call(drop, [found])
+    build.ret_void()
 
 
 def numbers(build: ir.IRBuilder, buffers: ir.Value, k: int, kind: ir.Type) -> ir.Value:

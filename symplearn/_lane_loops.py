@@ -137,7 +137,7 @@ def _flat(program: Jaxpr) -> Iterator[JaxprEqn]:
 def _batched(values: Sequence[Any], axes: Sequence[int | None], **p: Any) -> tuple[list[Any], list[int]]:
     """The loop of many lanes: by machine code where it can be written."""
     size = next(value.shape[axis] for value, axis in zip(values, axes, strict=True) if axis is not None)
-    lanes = filling(size)
+    lanes = filling(size, p["jaxpr"].jaxpr)
     name = code_of(Loop(p), tuple(axis is not None for axis in axes), lanes) if _is_wanted() else None
     if name is None:
         found = jax.vmap(lambda *some: _in_parts(*some, **p), tuple(axes), axis_size=size)(*values)

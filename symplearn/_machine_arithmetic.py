@@ -1,5 +1,6 @@
 """Numbers of machine code, their slopes along many directions, and the arithmetic that both are worked out with."""
 
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,6 +43,13 @@ def kind_of(value: ir.Value) -> ir.Type:
 def known(dual: Dual) -> Any:
     """What a constant is; None for anything else."""
     return dual.value.constant if isinstance(dual.value, ir.Constant) else None
+
+# ln 2 in two parts, of which the first has so few digits that its products with exponents are exact.
+_LN2 = 6.93147180369123816490e-01, 1.90821492927058770002e-10
+# A number whose sum with another has that one's nearest integer in its last bits.
+_NEAREST = 1.5 * 2.0**52
+# Beyond, an exponential is not finite, or as good as zero.
+_LARGEST, _SMALLEST = 709.782712893384, -708.0
 
 
 class Arithmetic:
@@ -115,6 +123,8 @@ class Arithmetic:
         """A function of the C library, of every entry of registers."""
         if not any(isinstance(value.type, ir.VectorType) for value in values):
             return self._called(name, DOUBLE, values)
+        if name == "exp":
+            return exponential(self, *values)
         wide, out = [self.wide(value) for value in values], ir.Constant(self.register, ir.Undefined)
         for k in range(self.width):
             place = ir.Constant(SHORT, k)
@@ -148,3 +158,19 @@ class Arithmetic:
             square = self.times(square, square) if left else square
         out = self.number(1.0) if out is None else out
         return self.over(self.number(1.0), out) if exponent < 0 else out
+
+
+def exponential(on: Arithmetic, x: ir.Value) -> ir.Value:
+    """exp of every entry of a register: 2^n exp(r), with |r| of at most ln 2 / 2, whose series ends below rounding."""
+    whole, build = ir.VectorType(INTEGER, on.width), on.builder
+    shifted = on.plus(on.times(x, on.number(1.0 / math.log(2.0))), on.number(_NEAREST))
+    n = on.minus(shifted, on.number(_NEAREST))
+    r = on.minus(on.minus(x, on.times(n, on.number(_LN2[0]))), on.times(n, on.number(_LN2[1])))
+    series: ir.Value = on.number(1.0 / math.factorial(13))
+    for k in reversed(range(13)):
+        series = on.plus(on.times(series, r), on.number(1.0 / math.factorial(k)))
+    exponent = build.shl(build.bitcast(shifted, whole), on.wide(ir.Constant(INTEGER, 52)))
+    found = build.bitcast(build.add(build.bitcast(series, whole), exponent), on.register)
+    found = on.chosen(on.compared(">", x, on.number(_LARGEST)), on.number(math.inf), found)
+    found = on.chosen(on.compared("<", x, on.number(_SMALLEST)), on.number(0.0), found)
+    return on.chosen(on.compared("uno", x, x), x, found)

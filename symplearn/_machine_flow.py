@@ -1,7 +1,6 @@
 """Calls, branches and loops as machine code, and parts of arrays that they look for."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -10,7 +9,10 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn
 from llvmlite import ir
 
 from ._machine_arithmetic import INTEGER, Dual, Unsupported, kind_of, known
-from ._machine_memory import AbstractCode, AbstractTable, Cells, shaped
+from ._machine_block_rules import stacked
+from ._machine_blocks import Block
+from ._machine_loops import counted
+from ._machine_memory import AbstractCode, AbstractTable, BlockTable, Cells, shaped
 
 # Loops of at most so many steps are written down step by step where that tells places in arrays.
 _FEW = 16
@@ -38,7 +40,7 @@ def _inlined_open(code: AbstractCode, one: JaxprEqn, values: list[Any]) -> list[
 
 def _by_its_own_slopes(code: AbstractCode, one: JaxprEqn, values: list[Any]) -> list[Any]:
     """A function with a derivative of its own."""
-    if all(entry.slope is None for array in values for entry in array.ravel()):
+    if code.beside or all(entry.slope is None for array in values for entry in array.ravel()):
         return code.evaluated(one.params["call_jaxpr"], values)
     plain = [each(lambda dual: Dual(dual.value), array) for array in values]
     slopes = [each(lambda dual: Dual(dual.slope), array) for array in values]  # numbers to work with, here
@@ -83,7 +85,8 @@ def _on_a_processor(code: AbstractCode, one: JaxprEqn, values: list[Any]) -> lis
 
 def _all_branches(code: AbstractCode, one: JaxprEqn, index: ir.Value, operands: list[Any]) -> list[Any]:
     """What each lane's branch comes to, out of all of them."""
-    found = [code.evaluated(program, operands) for program in one.params["branches"]]
+    found = [[code.in_registers(value) for value in code.evaluated(program, operands)]
+             for program in one.params["branches"]]  # fmt: skip
     out = found[-1]
     for k, some in reversed(list(enumerate(found[:-1]))):
         mine = code.builder.icmp_signed("==", *code.pair(index, ir.Constant(kind_of(index), k)))
@@ -121,7 +124,7 @@ def _scan(code: AbstractCode, one: JaxprEqn, values: list[Any]) -> list[Any]:
     told = one.outvars[p["num_carry"] :]
     if told and not code.beside:
         raise Unsupported("a loop that tells what it passes")
-    rooms = [code.room(code.kept_as(shaped(atom).dtype), shaped(atom).shape) for atom in told]
+    rooms = [code.room_for(shaped(atom).dtype, shaped(atom).shape) for atom in told]
     tables = [value if isinstance(value, AbstractTable) else code.table(value) for value in values[last:]]
     cells = Cells(code, one.outvars[: p["num_carry"]])
     cells.store(values[given:last])
@@ -147,35 +150,26 @@ def looped(
         cells.store(found[: p["num_carry"]])
 
 
-@contextmanager
-def counted(build: ir.IRBuilder, end: ir.Value, step: int = 1) -> Iterator[ir.Value]:
-    """A loop around what is written within, for 0, `step`, ... below the end."""
-    with build.goto_entry_block():
-        count = build.alloca(INTEGER)
-    build.store(ir.Constant(INTEGER, 0), count)
-    again, inside, done = map(build.append_basic_block, ("again", "inside", "done"))
-    build.branch(again)
-    build.position_at_end(again)
-    k = build.load(count)
-    build.cbranch(build.icmp_signed("<", k, end), inside, done)
-    build.position_at_end(inside)
-    yield k
-    build.store(build.add(k, ir.Constant(INTEGER, step)), count)
-    build.branch(again)
-    build.position_at_end(done)
-
-
 def _step_by_step(code: AbstractCode, one: JaxprEqn, values: list[Any]) -> list[Any]:
     """A short loop, every step of which is written down, so that places in arrays are known."""
     p = one.params
     given, last, carried = p["num_consts"], p["num_consts"] + p["num_carry"], p["num_carry"]
     now, told = values[given:last], []
     for k in range(p["length"])[:: -1 if p["reverse"] else 1]:
-        found = code.evaluated(p["jaxpr"], [*values[:given], *now, *(value[k, ...] for value in values[last:])])
+        found = code.evaluated(p["jaxpr"], [*values[:given], *now, *(_row_of(code, value, k) for value in values[last:])])
         now = found[:carried]
         told.append(found[carried:])
-    rows = told[:: -1 if p["reverse"] else 1]
-    return [*now, *(np.stack(column) for column in zip(*rows, strict=True))]
+    in_order = told[:: -1 if p["reverse"] else 1]
+    found = [*now, *(stacked(code, column, 0) for column in zip(*in_order, strict=True))]
+    shapes = map(shaped, one.outvars)
+    return [code.settled(value, some.shape, some.dtype) for value, some in zip(found, shapes, strict=True)]
+
+
+def _row_of(code: AbstractCode, value: Any, k: int) -> Any:
+    """A row of an array, which may be a block."""
+    if not isinstance(value, Block):
+        return value[k, ...]
+    return code.settled(value.moved(lambda layout: layout[k, ...]), value.shape[1:], "float64")
 
 
 def _asks_for_places(program: Jaxpr) -> bool:
@@ -191,8 +185,10 @@ def programs_in(one: JaxprEqn) -> list[Jaxpr]:
     return [part.jaxpr if isinstance(part, ClosedJaxpr) else part for part in parts if isinstance(part, kinds)]
 
 
-def _all_of(code: AbstractCode, table: AbstractTable) -> np.ndarray:
+def _all_of(code: AbstractCode, table: AbstractTable) -> Any:
     """All numbers of a table."""
+    if isinstance(table, BlockTable):
+        return code.settled(table.block, table.shape, "float64")
     rows = [table.row(code, ir.Constant(INTEGER, k)) for k in range(table.shape[0])]
     return np.stack(rows) if rows else np.empty(table.shape, object)
 
@@ -201,6 +197,8 @@ def _looked_up(code: AbstractCode, one: JaxprEqn, values: list[Any]) -> list[Any
     """A row of a table, or a part of an array at a place that is known."""
     table, first, *_ = values
     sizes = one.params["slice_sizes"]
+    if isinstance(table, Block):
+        return [_of_a_block(code, table, values[1:], sizes)]
     if not isinstance(table, AbstractTable):
         if sizes == (1, *table.shape[1:]) and known(values[1].item()) is None and code.width == 1:
             return [code.table(table).row(code, _within(code, values[1].item().value, len(table))).reshape(sizes)]
@@ -213,6 +211,16 @@ def _looked_up(code: AbstractCode, one: JaxprEqn, values: list[Any]) -> list[Any
     return [table.row(code, place).reshape(sizes)]
 
 
+def _of_a_block(code: AbstractCode, block: Block, places: Sequence[np.ndarray], sizes: Sequence[int]) -> Any:
+    """A row of a block, or a part of it at a place that is known."""
+    if sizes == (1, *block.shape[1:]) and known(places[0].item()) is None and not code.is_lane_wise(places[0].item()):
+        found = block.at(code.builder, _within(code, places[0].item().value, block.shape[0]))
+        return code.settled(found.moved(lambda layout: layout[None]), sizes, "float64")
+    starts = _starts(places, block.shape, sizes)
+    part = tuple(slice(at, at + size) for at, size in zip(starts, sizes, strict=True))
+    return code.settled(block.moved(lambda layout: layout[part]), sizes, "float64")
+
+
 def _within(code: AbstractCode, place: ir.Value, count: int) -> ir.Value:
     """The nearest row that there is."""
     build, last = code.builder, ir.Constant(INTEGER, count - 1)
@@ -223,11 +231,11 @@ def _within(code: AbstractCode, place: ir.Value, count: int) -> ir.Value:
 
 def _replaced(code: AbstractCode, one: JaxprEqn, values: list[Any]) -> list[Any]:
     """An array with a part of it changed, at a place that is known."""
-    array, part, *first = values
+    array, part, *first = map(code.in_registers, values)
     starts = _starts(first, array.shape, part.shape)
     out = array.copy()
     out[tuple(slice(at, at + size) for at, size in zip(starts, part.shape, strict=True))] = part
-    return [out]
+    return [code.settled(out, out.shape, shaped(one.outvars[0]).dtype)]
 
 
 def _starts(places: Sequence[np.ndarray], shape: Sequence[int], sizes: Sequence[int]) -> list[int]:

@@ -11,8 +11,12 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn
 from llvmlite import ir
 
-from ._machine_arithmetic import INTEGER, Arithmetic, Dual, Unsupported, kind_of, type_of
+from ._machine_arithmetic import DOUBLE, INTEGER, Arithmetic, Dual, Unsupported, kind_of, type_of
+from ._machine_blocks import MANY, Block, Pending, Workspace
+from ._machine_kernels import copied
 
+# Entries of a block that may become numbers in registers, for an operation that has no other way.
+_FEW = 256
 # Bytes of all tables that are filled when they are run: they lie on the stack, which threads have half a megabyte of.
 _MOST_KEPT = 1 << 18
 
@@ -22,16 +26,83 @@ class AbstractCode(Arithmetic):
 
     The entries of a register are the slopes of a number along so many directions; or, with `beside`, registers are what
     is computed, of so many lanes side by side, and nothing has slopes. More than `most` operations are not written.
+    With a workspace, arrays of many numbers are blocks in it.
     """
 
-    def __init__(self, builder: ir.IRBuilder, width: int, beside: bool = False, most: int = sys.maxsize):
+    def __init__(
+        self,
+        builder: ir.IRBuilder,
+        width: int,
+        beside: bool = False,
+        most: int = sys.maxsize,
+        work: Workspace | None = None,
+    ):
         super().__init__(builder, width, most)
-        self.beside, self.kept = beside, 0
+        self.beside, self.kept, self.space = beside, 0, work
         self._sloped: dict[int, tuple[Any, ClosedJaxpr]] = {}
+
+    @abc.abstractmethod
+    def plainly(self, one: JaxprEqn, values: list[Any]) -> Sequence[Any]:
+        """What an operation makes of arrays of numbers in registers."""
+
+    @abc.abstractmethod
+    def ruled(self, one: JaxprEqn, entries: Sequence[Dual]) -> Dual:
+        """What an operation makes of single numbers."""
 
     @abc.abstractmethod
     def evaluated(self, program: ClosedJaxpr, values: Sequence[Any]) -> list[Any]:
         """What a traced function yields."""
+
+    @property
+    def work(self) -> Workspace:
+        """The workspace, which there is where blocks are met."""
+        assert self.space is not None
+        return self.space
+
+    def is_lane_wise(self, dual: Dual) -> bool:
+        """Whether a number is another in every lane."""
+        return isinstance(dual.value.type, ir.VectorType)
+
+    def is_many(self, shape: Sequence[int], dtype: Any) -> bool:
+        """Whether an array is a block, or of one number everywhere."""
+        return self.space is not None and is_real(dtype) and math.prod(shape) >= MANY
+
+    def block_of(self, value: Any) -> Block:
+        """An array as a block."""
+        if isinstance(value, Block):
+            return value
+        into, number = self.work.block(value.shape), alike(value)
+        if number is not None:
+            copied(self.work, into, number.value, exact=False)
+            return into
+        for place in np.ndindex(value.shape):
+            part = into.moved(lambda layout, place=place: layout[(*(slice(k, k + 1) for k in place), ...)])
+            assert part is not None
+            copied(self.work, part, value[place].value)
+        return into
+
+    def in_registers(self, value: Any) -> Any:
+        """An array as one of numbers in registers."""
+        if not isinstance(value, Block):
+            return value
+        if value.size > _FEW:
+            raise Unsupported("an operation on many numbers")
+        first, out = value.start(self.builder), np.empty(value.shape, object)
+        for place in np.ndindex(out.shape):
+            at = sum(k * stride for k, stride in zip(place, value.side.strides, strict=True))
+            pointer = self.builder.gep(first, [ir.Constant(INTEGER, at)])
+            if self.width > 1 and not value.alone:
+                pointer = self.builder.bitcast(pointer, self.register.as_pointer())
+            out[place] = Dual(self.builder.load(pointer, align=8))
+        return out
+
+    def settled(self, value: Any, shape: Sequence[int], dtype: Any) -> Any:
+        """An array as it is kept: in registers, or as a block."""
+        if self.space is None or isinstance(value, Pending):
+            return value
+        if isinstance(value, Block):
+            return value if self.is_many(shape, dtype) else self.in_registers(value)
+        return self.block_of(value) if self.is_many(shape, dtype) and alike(value) is None else value
 
     def kept_as(self, dtype: Any) -> ir.Type:
         """The type in which a value is kept in memory."""
@@ -44,13 +115,26 @@ class AbstractCode(Arithmetic):
     def constant(self, array: Any) -> Any:
         """Numbers that are known when the code is written; those of a loop are looked up in a table."""
         plain = np.asarray(array)
+        if self.is_many(plain.shape, plain.dtype):
+            return self._block_of_constants(plain)
         out = np.empty(plain.shape, object)
         for place in np.ndindex(plain.shape):
             out[place] = Dual(ir.Constant(type_of(plain.dtype), plain[place].item()))
         return out
 
-    def table(self, values: np.ndarray) -> "Table":
+    def _block_of_constants(self, array: np.ndarray) -> Any:
+        if (array == array.flat[0]).all():
+            return np.broadcast_to(np.array(Dual(ir.Constant(DOUBLE, array.flat[0].item())), object), array.shape)
+        row, module = ir.Constant(ir.ArrayType(DOUBLE, array.size), array.ravel().tolist()), self.builder.module
+        kept = ir.GlobalVariable(module, row.type, module.get_unique_name("block"))
+        kept.initializer, kept.global_constant, kept.linkage = row, True, "internal"
+        zero, layout = ir.Constant(INTEGER, 0), np.empty(array.shape, np.int8)
+        return Block(kept.gep([zero, zero]), layout, layout, 1, alone=True, fixed=True)
+
+    def table(self, values: Any) -> "AbstractTable":
         """A table of numbers."""
+        if isinstance(values, Block):
+            return BlockTable(values)
         entries = [entry.value for entry in values.ravel()]
         if not entries or not all(isinstance(entry, ir.Constant) for entry in entries):
             return self._table_of_lanes(values)
@@ -71,8 +155,14 @@ class AbstractCode(Arithmetic):
             found.write(self, ir.Constant(INTEGER, k), entry)
         return found
 
+    def room_for(self, dtype: Any, shape: tuple[int, ...]) -> "AbstractTable":
+        """Memory for a table that is written row by row, of what is told along a loop."""
+        if self.space is not None and is_real(dtype) and math.prod(shape):
+            return BlockTable(self.space.block(shape))
+        return self.room(self.kept_as(dtype), shape)
+
     def room(self, kind: ir.Type, shape: tuple[int, ...]) -> "Table":
-        """Memory for a table that is written row by row."""
+        """The same on the stack."""
         self.kept += 8 * self.width * math.prod(shape)
         if self.kept > _MOST_KEPT:
             raise Unsupported("much that is kept on the way")
@@ -135,6 +225,35 @@ class Table(AbstractTable):
         code.builder.store(code.wide(value), code.builder.gep(self.pointer, [entry]))
 
 
+class BlockTable(AbstractTable):
+    """A block as a table."""
+
+    def __init__(self, block: Block):
+        self.block, self.shape = block, block.shape
+
+    def read(self, code: AbstractCode, entry: ir.Value) -> ir.Value:
+        raise Unsupported("single numbers of a table that is a block")
+
+    def write(self, code: AbstractCode, entry: ir.Value, value: ir.Value) -> None:
+        raise Unsupported("single numbers of a table that is a block")
+
+    def row(self, code: AbstractCode, place: ir.Value) -> Any:
+        return code.settled(self.block.at(code.builder, place), self.shape[1:], "float64")
+
+    def set_row(self, code: AbstractCode, place: ir.Value, values: Any) -> None:
+        copied(code.work, self.block.at(code.builder, place), code.block_of(values))
+
+
+def is_real(dtype: Any) -> bool:
+    return str(dtype) == "float64"
+
+
+def alike(value: np.ndarray) -> Dual | None:
+    """The number that all entries of an array are, if so it is."""
+    first = value.flat[0] if value.size else None
+    return first if first is not None and all(one is first for one in value.flat) else None
+
+
 def shaped(atom: Any) -> Any:
     """Shape and type of what stands for a value in a traced function."""
     return atom.aval
@@ -145,28 +264,46 @@ class Cells:
 
     def __init__(self, code: AbstractCode, atoms: Sequence[Any]):
         self.code, self.shapes, build = code, list(map(shaped, atoms)), code.builder
+        self.blocks = [code.work.block(s.shape) if code.is_many(s.shape, s.dtype) else None for s in self.shapes]
         with build.goto_entry_block():
             self.cells = [
                 [(build.alloca(code.kept_as(s.dtype)),
                   build.alloca(code.register) if s.dtype == float and not code.beside else None)
-                 for _ in range(math.prod(s.shape))]
-                for s in self.shapes
+                 for _ in range(0 if block else math.prod(s.shape))]
+                for s, block in zip(self.shapes, self.blocks, strict=True)
             ]  # fmt: skip
         self.sloped = [np.zeros(s.shape, bool) for s in self.shapes]
 
-    def store(self, values: Sequence[np.ndarray]) -> None:
+    def store(self, values: Sequence[Any]) -> None:
         build = self.code.builder
-        for cells, array, sloped in zip(self.cells, values, self.sloped, strict=True):
+        values = [self._apart(value) for value in values]
+        for block, cells, array, sloped in zip(self.blocks, self.cells, values, self.sloped, strict=True):
+            if block is not None:
+                number = None if isinstance(array, Block) else alike(array)
+                copied(self.code.work, block, self.code.block_of(array) if number is None else number.value, exact=False)
+                continue
             for (cell, slopes), entry, place in zip(cells, array.ravel(), np.ndindex(array.shape), strict=True):
                 build.store(self.code.fitted(entry.value, cell.type.pointee), cell)
                 if slopes is not None:
                     build.store(self.code.slope(entry), slopes)
                     sloped[place] |= entry.slope is not None
 
-    def load(self) -> list[np.ndarray]:
+    def _apart(self, value: Any) -> Any:
+        """A value that does not lie in these cells, of which another may be written first."""
+        own = [block.stretch for block in self.blocks if block]
+        if not isinstance(value, Block) or value.stretch not in own:
+            return value
+        into = self.code.work.block(value.shape)
+        copied(self.code.work, into, value, exact=False)
+        return into
+
+    def load(self) -> list[Any]:
         """The values; what has had no slope wherever it was stored has none."""
         build, out = self.code.builder, []
-        for cells, one, sloped in zip(self.cells, self.shapes, self.sloped, strict=True):
+        for block, cells, one, sloped in zip(self.blocks, self.cells, self.shapes, self.sloped, strict=True):
+            if block is not None:
+                out.append(block)
+                continue
             array = np.empty(one.shape, object)
             for (cell, slopes), place in zip(cells, np.ndindex(array.shape), strict=True):
                 array[place] = Dual(build.load(cell), build.load(slopes) if sloped[place] else None)

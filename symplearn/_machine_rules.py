@@ -202,6 +202,12 @@ def _smooth(name: str, rate: Callable[[Arithmetic, ir.Value, ir.Value], ir.Value
     return rule
 
 
+def _logistic(on: Arithmetic, p: Any, a: Dual) -> Dual:
+    one = on.number(1.0)
+    value = on.over(one, on.plus(one, on.called("exp", on.builder.fneg(a.value))))
+    return Dual(value, None if a.slope is None else on.times(on.times(value, on.minus(one, value)), a.slope))
+
+
 def _over_root(sign: float, square: float) -> Callable[[Arithmetic, ir.Value, ir.Value], ir.Value]:
     """1 / sqrt(sign + square x^2), the derivative of inverse functions."""
 
@@ -254,6 +260,7 @@ RULES: dict[str, _Rule] = {
     "integer_pow": _integer_power,
     "is_finite": _finite,
     "le": _compared("<="),
+    "logistic": _logistic,
     "log": _smooth("log", lambda on, x, f: on.over(on.number(1.0), x)),
     "lt": _compared("<"),
     "max": _larger(">"),

@@ -55,6 +55,13 @@ def _kept(text: str, make: Callable[[], bytes]) -> bytes:
 
 
 @cache
+def span() -> int:
+    """How many real numbers a register of this processor holds, as far as arrays are worked out by it."""
+    _machine()
+    return 8 if "+avx512f" in _features() else 4
+
+
+@cache
 def _machine() -> Any:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()

@@ -15,7 +15,7 @@ OF_ONE = {
     "square": lax.square, "copy": jnp.copy,
     "acos": lambda x: jnp.arccos(0.5 * x), "asin": lambda x: jnp.arcsin(0.5 * x),
     "atanh": lambda x: jnp.arctanh(0.5 * x),
-    "acosh": lambda x: jnp.arccosh(2 + x), "log": lambda x: jnp.log(2 + x), "sqrt": lambda x: jnp.sqrt(2 + x),
+    "acosh": lambda x: jnp.arccosh(2 + x), "logistic": jax.nn.sigmoid, "log": lambda x: jnp.log(2 + x), "sqrt": lambda x: jnp.sqrt(2 + x),
     "integer_pow": lambda x: x**5 + x**-3 + x**1,
     "pow": lambda x: (2 + x) ** (1.5 + x) + (2 + x) ** 0.3,
     "atan2": lambda x: jnp.arctan2(x, x[::-1] - 0.2) + jnp.arctan2(1.0, x) + jnp.arctan2(x, 2.0),

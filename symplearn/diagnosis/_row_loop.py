@@ -9,7 +9,7 @@ from llvmlite import ir
 
 from .._machine_arithmetic import DOUBLE, INTEGER, Dual
 from .._machine_code import Code
-from .._machine_flow import counted
+from .._machine_loops import counted
 from .._machine_memory import Cells, Table
 
 WIDTH = 8  # directions in one register
