@@ -29,8 +29,9 @@ def loops_of(function: Callable[..., Any], *arguments: Any) -> tuple[CompiledLoo
     """How the loops of a function, as of a score or of its gradient, are compiled on a processor; not those inside of
     other loops.
 
-    Filters have machine code where it can be written: arithmetic of double precision, loops, and branches; no sorting,
-    no random numbers, and no large matrices or networks, whose functions would be too long.
+    Filters have machine code where it can be written: arithmetic of double precision, loops, branches, and products of
+    matrices, as of networks; no sorting, no random numbers, and no long function of numbers that are worked out one by
+    one, as with states of eight and more.
     """
     program = jax.make_jaxpr(with_lane_loops(function))(*arguments)
     return tuple(CompiledLoop(one.params["length"], _reason(one.params)) for one in _loops(program.jaxpr))

@@ -44,6 +44,7 @@ def known(dual: Dual) -> Any:
     """What a constant is; None for anything else."""
     return dual.value.constant if isinstance(dual.value, ir.Constant) else None
 
+
 # ln 2 in two parts, of which the first has so few digits that its products with exponents are exact.
 _LN2 = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 # A number whose sum with another has that one's nearest integer in its last bits.

@@ -15,12 +15,15 @@ from ._machine_places import PLACED
 from ._machine_rules import RULES, spared
 
 _Values = list[Any]
+# Products of numbers that are kept before they are summed.
+_MOST = 1 << 14
 
 
 def applied(code: AbstractCode, one: JaxprEqn, values: _Values, turned: bool, joined: bool) -> _Values:
     """What an operation yields, of which something is, or may become, a block; `turned` where a matrix is about to
     have its rows and columns exchanged, `joined` where it is only ever added to something."""
     name = one.primitive.name
+    found: Sequence[Any]
     if any(isinstance(value, Pending) for value in values):
         return [_with_pending(code, values)]
     real = all(is_real(shaped(atom).dtype) for atom in (*one.outvars, *one.invars[name == "select_n" :]))
@@ -34,6 +37,11 @@ def applied(code: AbstractCode, one: JaxprEqn, values: _Values, turned: bool, jo
         found = code.plainly(one, [code.in_registers(value) for value in values])
     return [code.settled(value, shaped(atom).shape, shaped(atom).dtype)
             for value, atom in zip(found, one.outvars, strict=True)]  # fmt: skip
+
+
+def _plainly(code: AbstractCode, one: JaxprEqn, values: _Values) -> _Values:
+    """By numbers in registers."""
+    return list(code.plainly(one, [code.in_registers(value) for value in values]))
 
 
 def _is_plain(one: JaxprEqn, values: _Values) -> bool:
@@ -54,8 +62,8 @@ def _entry_by_entry(code: AbstractCode, one: JaxprEqn, values: _Values) -> Any:
     for number, value in zip(stand, values, strict=True):
         if less is number:
             return value if value.shape == shape else _full(number, shape)
-    if all(number is not None for number in numbers):
-        return _full(code.ruled(one, numbers), shape)
+    if None not in numbers:
+        return _full(code.ruled(one, stand), shape)
     # Sides of length one are spread along the others'.
     operands = [_moved(code, code.block_of(value), lambda layout: np.broadcast_to(layout, shape))
                 if number is None else number.value
@@ -76,14 +84,20 @@ def _moved(code: AbstractCode, value: Any, rule: Callable[[np.ndarray], np.ndarr
     """An array whose entries are the same in another order."""
     if not isinstance(value, Block):
         return rule(value)
-    found = value.moved(rule)
-    if found is None:
-        into = code.work.block(value.shape)
-        whole = Block(into.pointer, into.whole, into.whole, into.unit, stretch=into.stretch)
-        tight = Block(into.pointer, *2 * (np.empty(value.shape, np.int8),), into.unit, stretch=whole.stretch)
-        copied(code.work, tight, value)
-        found = tight.moved(rule)
+    return value.moved(rule) or _end_to_end(code, value).viewed(rule)
+
+
+def _end_to_end(code: AbstractCode, block: Block) -> Block:
+    """A copy whose rows lie end to end, so that they are of any shape."""
+    into, layout = code.work.block(block.shape), np.empty(block.shape, np.int8)
+    found = Block(into.pointer, layout, layout, into.unit, stretch=into.stretch)
+    copied(code.work, found, block)
     return found
+
+
+def _kth(rule: Any, code: AbstractCode, one: JaxprEqn, k: int) -> Callable[[np.ndarray], np.ndarray]:
+    """One of what an operation yields of a single array."""
+    return lambda layout: rule(code, one, [layout])[k]
 
 
 def _by_moving(name: str) -> Callable[[AbstractCode, JaxprEqn, _Values], _Values]:
@@ -93,7 +107,7 @@ def _by_moving(name: str) -> Callable[[AbstractCode, JaxprEqn, _Values], _Values
         if not isinstance(values[0], Block):
             return PLACED[name](code, one, values)
         count = len(one.outvars)
-        return [_moved(code, values[0], lambda layout, k=k: PLACED[name](code, one, [layout])[k]) for k in range(count)]
+        return [_moved(code, values[0], _kth(PLACED[name], code, one, k)) for k in range(count)]
 
     return rule
 
@@ -112,14 +126,14 @@ def _joined(code: AbstractCode, one: JaxprEqn, values: _Values) -> _Values:
     into, axis, first = code.work.block(shaped(one.outvars[0]).shape), one.params["dimension"], 0
     for value in values:
         size = value.shape[axis]
-        where = (*[slice(None)] * axis, slice(first, first + size))
         if size:
-            copied(code.work, into.moved(lambda layout, where=where: layout[where]), _source(code, value))
+            part = into.part(*[slice(None)] * axis, slice(first, first + size))
+            copied(code.work, part, code.source(value))
         first += size
     return [into]
 
 
-def stacked(code: AbstractCode, values: _Values, axis: int) -> Any:
+def stacked(code: AbstractCode, values: Sequence[Any], axis: int) -> Any:
     """Arrays of one shape along a new axis; a block where there is one among them."""
     if not any(isinstance(value, Block) for value in values):
         return np.stack(values, axis)
@@ -128,8 +142,7 @@ def stacked(code: AbstractCode, values: _Values, axis: int) -> Any:
     shape = values[0].shape
     into = code.work.block((*shape[:axis], len(values), *shape[axis:]))
     for k, value in enumerate(values):
-        where = (*[slice(None)] * axis, k, ...)
-        copied(code.work, into.moved(lambda layout, where=where: layout[where]), _source(code, value))
+        copied(code.work, into.part(*[slice(None)] * axis, k), code.source(value))
     return into
 
 
@@ -137,29 +150,26 @@ def _padded(code: AbstractCode, one: JaxprEqn, values: _Values) -> _Values:
     array, filling = values
     config = one.params["padding_config"]
     if any(low < 0 or high < 0 or inner for low, high, inner in config):
-        return list(code.plainly(one, [code.in_registers(value) for value in values]))
+        return _plainly(code, one, values)
     into = code.work.block(shaped(one.outvars[0]).shape)
     copied(code.work, into, filling[()].value, exact=False)
     where = tuple(slice(low, low + n) for (low, _, _), n in zip(config, array.shape, strict=True))
     if math.prod(array.shape):
-        copied(code.work, into.moved(lambda layout: layout[where]), _source(code, array))
+        copied(code.work, into.part(*where), code.source(array))
     return [into]
 
 
-def _source(code: AbstractCode, value: Any) -> Any:
-    """What is to be copied: a number, if it is the same everywhere, or a block."""
-    number = _alike(value)
-    return code.block_of(value) if number is None else number.value
-
-
 def _sum(code: AbstractCode, one: JaxprEqn, values: _Values) -> _Values:
-    block, axes = code.block_of(values[0]), tuple(one.params["axes"])
+    return [_summed(code, code.block_of(values[0]), one.params["axes"])]
+
+
+def _summed(code: AbstractCode, block: Block, axes: Sequence[Any]) -> Any:
+    """Sums along axes."""
     kept = [k for k in range(len(block.shape)) if k not in axes]
-    turned = block.moved(lambda layout: layout.transpose(*kept, *axes)[None])
-    assert turned is not None
+    turned = block.viewed(lambda layout: layout.transpose(*kept, *axes)[None])
     into = code.work.block((1, *(block.shape[k] for k in kept)))
     summed(code.work, into, turned, len(kept) + 1)
-    return [into.moved(lambda layout: layout[0, ...])]
+    return into.part(0)
 
 
 def _with_pending(code: AbstractCode, values: _Values) -> Any:
@@ -175,17 +185,36 @@ def _contracted(code: AbstractCode, one: JaxprEqn, values: _Values, turned: bool
     """A sum of products over some axes, as a product of two matrices."""
     along, shared = one.params["dimension_numbers"]
     if shared[0]:
-        return list(code.plainly(one, [code.in_registers(value) for value in values]))
+        return [_row_by_row(code, values, along, shared)]
     left, right = (_matrix(code, value, axes) for value, axes in zip(values, along, strict=True))
     shape = shaped(one.outvars[0]).shape
-    if joined and code.is_many(shape, "float64"):
+    if joined and code.is_many(shape, "float64") and shape == (left.shape[0], right.shape[0]):
         return [Pending(left, right)]
     # Rows are the first's and columns the second's; the other way round where that is asked for next.
     if turned:
-        found = _product(code, right, left).moved(np.transpose)
+        found = _product(code, right, left).viewed(np.transpose)
     else:
         found = _product(code, left, right)
     return [_moved(code, found, lambda layout: layout.reshape(shape))]
+
+
+def _row_by_row(code: AbstractCode, values: _Values, along: Any, shared: Any) -> Any:
+    """Sums of products of which some axes are shared: all products, and their sums."""
+    kept = [[k for k in range(len(value.shape)) if k not in (*axes, *own)]
+            for value, axes, own in zip(values, along, shared, strict=True)]  # fmt: skip
+    orders = [(*own, *rest, *axes) for own, rest, axes in zip(shared, kept, along, strict=True)]
+    left = code.block_of(values[0]).viewed(lambda layout: layout.transpose(orders[0]))
+    right = code.block_of(values[1]).viewed(lambda layout: layout.transpose(orders[1]))
+    first, free, other = len(shared[0]), len(kept[0]), len(kept[1])
+    sizes = (*left.shape[: first + free], *right.shape[first : first + other], *left.shape[first + free :])
+    if math.prod(sizes) > _MOST:
+        raise Unsupported("many products of matrices side by side")
+    into = code.work.block(sizes)
+    spread = lambda layout, where: np.broadcast_to(np.expand_dims(layout, tuple(where)), sizes)  # noqa: E731
+    factors = [left.viewed(lambda layout: spread(layout, range(first + free, first + free + other))),
+               right.viewed(lambda layout: spread(layout, range(first, first + free)))]  # fmt: skip
+    entrywise(code.work, lambda on, a, b: RULES["mul"](on, {}, a, b), ("mul", None), into, *factors, exact=False)
+    return _summed(code, into, range(first + free + other, len(sizes)))
 
 
 def _matrix(code: AbstractCode, value: Any, axes: Sequence[int]) -> Block:
@@ -201,8 +230,7 @@ def _matrix(code: AbstractCode, value: Any, axes: Sequence[int]) -> Block:
 
 def _product(code: AbstractCode, rows: Block, columns: Block, more: Block | None = None) -> Block:
     """rows @ columns.T, added to `more`; the latter's rows are what registers hold."""
-    into, turned = code.work.block((rows.shape[0], columns.shape[0])), columns.moved(np.transpose)
-    assert turned is not None
+    into, turned = code.work.block((rows.shape[0], columns.shape[0])), columns.viewed(np.transpose)
     if code.work.step > 1 and turned.side.strides[1] != 1 and turned.shape[1] > 1:
         turned = _side_by_side(code, turned)
     multiplied(code.work, into, rows, turned, more)
@@ -228,10 +256,8 @@ def _side_by_side(code: AbstractCode, block: Block) -> Block:
 def _small_product(code: AbstractCode, one: JaxprEqn, values: _Values) -> _Values:
     left, right = (code.block_of(value) for value in values)
     if len(left.shape) != 2:
-        return list(code.plainly(one, [code.in_registers(value) for value in values]))
-    turned = right.moved(np.transpose)
-    assert turned is not None
-    return [_product(code, left, turned)]
+        return _plainly(code, one, values)
+    return [_product(code, left, right.viewed(np.transpose))]
 
 
 _BY_BLOCKS: dict[str, Callable[[AbstractCode, JaxprEqn, _Values], _Values]] = {

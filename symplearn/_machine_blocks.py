@@ -27,9 +27,10 @@ class Stretch:
 
 
 class Workspace:
-    """Memory in which machine code computes with blocks; `span` numbers fill a register where there is a single lane.
+    """Memory in which machine code computes with blocks; it begins at `begin`, and `span` numbers fill a register where
+    there is a single lane.
 
-    `begin` is where it begins, `known` a place in the function before any loop over time.
+    What is worked out once is written to the part `before` of a function, which comes before its loop over time.
     """
 
     def __init__(self, builder: ir.IRBuilder, width: int, span: int, begin: ir.Value):
@@ -51,8 +52,8 @@ class Workspace:
         return self.size - size
 
     def block(self, shape: tuple[int, ...], unused: bool = False) -> "Block":
-        """A new block. Its rows begin a register each. It is `unused` where nothing else is ever kept, as it must be for
-        what outlasts a turn of a loop."""
+        """A new block, each of whose rows begins a register. It is `unused` where nothing else is ever kept, as it must
+        be for what outlasts a turn of a loop."""
         sizes = list(shape)
         last = next((k for k in reversed(range(len(sizes))) if sizes[k] > 1), None)
         if last is not None:
@@ -61,7 +62,7 @@ class Workspace:
         stretch = Stretch(self, whole.size * self.width + -(whole.size * self.width) % 8, unused)
         with self.builder.goto_entry_block():
             pointer = self.builder.gep(self.begin, [ir.Constant(INTEGER, stretch.first)])
-        return Block(pointer, whole, whole[(*map(slice, shape), ...)], self.width, stretch=stretch)
+        return Block(pointer, whole, whole, self.width, stretch=stretch).part(*map(slice, shape))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +96,16 @@ class Block:
         if layout.size and not np.may_share_memory(layout, self.whole):
             return None
         return Block(self.pointer, self.whole, layout, self.unit, self.alone, self.fixed, self.stretch)
+
+    def viewed(self, rule: Callable[[np.ndarray], np.ndarray]) -> "Block":
+        """The same, of a rule that takes no copy: of parts, and of axes in another order."""
+        found = self.moved(rule)
+        assert found is not None
+        return found
+
+    def part(self, *where: Any) -> "Block":
+        """Some entries, by places or slices along its axes."""
+        return self.viewed(lambda layout: layout[(*where, ...)])
 
     def at(self, builder: ir.IRBuilder, place: ir.Value) -> "Block":
         """A row that is known when the code is run."""

@@ -11,8 +11,10 @@ from llvmlite import ir
 from ._machine_arithmetic import INTEGER, Dual, Unsupported, kind_of, known
 from ._machine_block_rules import stacked
 from ._machine_blocks import Block
+from ._machine_cells import Cells
+from ._machine_kernels import copied
 from ._machine_loops import counted
-from ._machine_memory import AbstractCode, AbstractTable, BlockTable, Cells, shaped
+from ._machine_memory import AbstractCode, AbstractTable, BlockTable, shaped
 
 # Loops of at most so many steps are written down step by step where that tells places in arrays.
 _FEW = 16
@@ -156,7 +158,8 @@ def _step_by_step(code: AbstractCode, one: JaxprEqn, values: list[Any]) -> list[
     given, last, carried = p["num_consts"], p["num_consts"] + p["num_carry"], p["num_carry"]
     now, told = values[given:last], []
     for k in range(p["length"])[:: -1 if p["reverse"] else 1]:
-        found = code.evaluated(p["jaxpr"], [*values[:given], *now, *(_row_of(code, value, k) for value in values[last:])])
+        rows = [_row_of(code, value, k) for value in values[last:]]
+        found = code.evaluated(p["jaxpr"], [*values[:given], *now, *rows])
         now = found[:carried]
         told.append(found[carried:])
     in_order = told[:: -1 if p["reverse"] else 1]
@@ -169,7 +172,7 @@ def _row_of(code: AbstractCode, value: Any, k: int) -> Any:
     """A row of an array, which may be a block."""
     if not isinstance(value, Block):
         return value[k, ...]
-    return code.settled(value.moved(lambda layout: layout[k, ...]), value.shape[1:], "float64")
+    return code.settled(value.part(k), value.shape[1:], "float64")
 
 
 def _asks_for_places(program: Jaxpr) -> bool:
@@ -213,12 +216,12 @@ def _looked_up(code: AbstractCode, one: JaxprEqn, values: list[Any]) -> list[Any
 
 def _of_a_block(code: AbstractCode, block: Block, places: Sequence[np.ndarray], sizes: Sequence[int]) -> Any:
     """A row of a block, or a part of it at a place that is known."""
-    if sizes == (1, *block.shape[1:]) and known(places[0].item()) is None and not code.is_lane_wise(places[0].item()):
+    if sizes == (1, *block.shape[1:]) and code.moves(places[0].item()):
         found = block.at(code.builder, _within(code, places[0].item().value, block.shape[0]))
-        return code.settled(found.moved(lambda layout: layout[None]), sizes, "float64")
+        return code.settled(found.viewed(lambda layout: layout[None]), sizes, "float64")
     starts = _starts(places, block.shape, sizes)
-    part = tuple(slice(at, at + size) for at, size in zip(starts, sizes, strict=True))
-    return code.settled(block.moved(lambda layout: layout[part]), sizes, "float64")
+    part = block.part(*(slice(at, at + size) for at, size in zip(starts, sizes, strict=True)))
+    return code.settled(part, sizes, "float64")
 
 
 def _within(code: AbstractCode, place: ir.Value, count: int) -> ir.Value:
@@ -231,11 +234,24 @@ def _within(code: AbstractCode, place: ir.Value, count: int) -> ir.Value:
 
 def _replaced(code: AbstractCode, one: JaxprEqn, values: list[Any]) -> list[Any]:
     """An array with a part of it changed, at a place that is known."""
-    array, part, *first = map(code.in_registers, values)
+    array, part, *first = values
+    place = first[0].item()
+    dtype = shaped(one.outvars[0]).dtype
+    if code.is_many(array.shape, dtype) and part.shape == (1, *array.shape[1:]) and code.moves(place):
+        return [_with_row(code, array, part, _within(code, place.value, array.shape[0]))]
+    array, part = map(code.in_registers, (array, part))
     starts = _starts(first, array.shape, part.shape)
     out = array.copy()
     out[tuple(slice(at, at + size) for at, size in zip(starts, part.shape, strict=True))] = part
-    return [code.settled(out, out.shape, shaped(one.outvars[0]).dtype)]
+    return [code.settled(out, out.shape, dtype)]
+
+
+def _with_row(code: AbstractCode, array: Any, part: Any, place: ir.Value) -> Block:
+    """A copy of an array of many numbers with another row, at a place that is known when the code is run."""
+    into = code.work.block(array.shape)
+    copied(code.work, into, code.block_of(array), exact=False)
+    copied(code.work, into.at(code.builder, place), code.block_of(part).part(0))
+    return into
 
 
 def _starts(places: Sequence[np.ndarray], shape: Sequence[int], sizes: Sequence[int]) -> list[int]:

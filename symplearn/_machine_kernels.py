@@ -251,4 +251,3 @@ class _Writer:
         for k, stride in zip(at, side.strides, strict=True):
             where = self.build.add(where, self.build.mul(k, ir.Constant(INTEGER, stride)))
         return self.build.gep(begin, [where])
-

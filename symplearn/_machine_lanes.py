@@ -5,17 +5,19 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jax.extend.core import Jaxpr, JaxprEqn
+from jax.extend.core import Jaxpr
 from llvmlite import ir
 
 from ._foreign_call import POINTERS, handler, numbers, with_memory
-from ._machine_blocks import MANY, Block, Workspace, pointers
 from ._machine_arithmetic import BIT, INTEGER, SHORT, Dual, Unsupported, type_of
+from ._machine_blocks import MANY, Block, Workspace, pointers
+from ._machine_cells import Cells
 from ._machine_code import Code
-from ._machine_flow import looped, programs_in
+from ._machine_flow import looped
 from ._machine_kernels import copied
 from ._machine_loops import counted
-from ._machine_memory import AbstractCode, AbstractTable, Cells, shaped
+from ._machine_memory import AbstractCode, AbstractTable
+from ._machine_sizes import is_worth_blocks, largest_array, largest_product
 from ._native import span
 
 # How many lanes one register may have.
@@ -27,15 +29,12 @@ _MOST = {1: 20_000, 4: 40_000, 8: 40_000}
 _MOST_GIVEN = 1024
 # Products of numbers in one of matrices from which on that is not written number by number.
 _LARGE = 1024
-# Products of numbers in a step for each number that it changes, from which on blocks are worth their copies: a
-# Householder reflection has one or two, a network's gradient hundreds.
-_WORTH = 8
 _BYTE = ir.IntType(8)
 
 
 def filling(lanes: int, program: Jaxpr) -> int:
     """How many lanes so many are filled up to, so that they fill registers: one that holds all, or several."""
-    if _products(program) >= _LARGE:
+    if largest_product(program) >= _LARGE:
         return lanes
     width = next((width for width in WIDTHS if width >= lanes), WIDTHS[-1])
     return lanes + -lanes % width
@@ -49,14 +48,14 @@ def lane_loop(p: Any, known: Mapping[int, np.ndarray], beside: Sequence[bool], l
     """
     program = p["jaxpr"].jaxpr
     width = max(width for width in WIDTHS if lanes % width == 0)
-    if _products(program) >= _LARGE:
+    if largest_product(program) >= _LARGE:
         # Matrices fill registers by themselves. Of eight lanes side by side they would fill no fast memory: 16 networks
         # of width 32 took a third longer.
         return _module(p, known, beside, lanes, 1, True)
     try:
         return _module(p, known, beside, lanes, width, False)
     except Unsupported:
-        if _entries(program) < MANY:
+        if largest_array(program) < MANY:
             raise
     return _module(p, known, beside, lanes, width, True)
 
@@ -66,8 +65,8 @@ def _module(
 ) -> ir.Module:
     """The same with so many lanes side by side, where arrays of many numbers are blocks in memory, or all numbers in
     registers."""
-    if blocks and _work(p["jaxpr"].jaxpr) < _WORTH * sum(one.size for one in p["jaxpr"].out_avals[: p["num_carry"]]):
-        raise Unsupported("a step that changes many numbers with little work")
+    if blocks and not is_worth_blocks(p):
+        raise Unsupported("many numbers of which no matrices are made")
     module = ir.Module("lanes")
     work = ir.Function(module, ir.FunctionType(ir.VoidType(), [POINTERS, POINTERS]), "work")
     if blocks:
@@ -80,37 +79,6 @@ def _module(
         _Lanes(p, known, beside, lanes, width, work).write()
     handler(module, work)
     return module
-
-
-def _entries(program: Jaxpr) -> int:
-    """Of the largest array in a traced function."""
-    own = [math.prod(shaped(atom).shape) for one in program.eqns for atom in (*one.invars, *one.outvars)]
-    return max([0, *own, *(_entries(inner) for one in program.eqns for inner in programs_in(one))])
-
-
-def _products(program: Jaxpr) -> int:
-    """Products of numbers in the largest product of matrices in a traced function."""
-    found = [0]
-    for one in program.eqns:
-        if one.primitive.name == "dot_general":
-            found.append(_products_of(one))
-        found += map(_products, programs_in(one))
-    return max(found)
-
-
-def _products_of(one: JaxprEqn) -> int:
-    """Rows times columns, rows times what is summed over, and that times columns: the root of all of them."""
-    return math.isqrt(math.prod(math.prod(shaped(atom).shape) for atom in (*one.invars, *one.outvars)))
-
-
-def _work(program: Jaxpr) -> int:
-    """Products of numbers in all products of matrices of a traced function, in loops as often as they go round."""
-    found = 0
-    for one in program.eqns:
-        if one.primitive.name == "dot_general":
-            found += _products_of(one)
-        found += one.params.get("length", 1) * sum(map(_work, programs_in(one)))
-    return found
 
 
 class _Stream(AbstractTable):
@@ -218,9 +186,9 @@ class _Lanes:
         for room, array in zip(rooms[: p["num_carry"]], cells.load(), strict=True):
             room.set_all(self.code, array)
 
-    def _gathered(self, block: Block, fixed: bool) -> Block:
-        """A block whose entries lie next to each other: a copy, where lanes lie in between."""
-        if not fixed or self.width > 1 or block.unit == 1:
+    def _gathered(self, block: Block) -> Block:
+        """A block that never changes, with entries that lie next to each other: a copy, where lanes lie in between."""
+        if not block.fixed or self.width > 1 or block.unit == 1:
             return block
         into = self.code.work.block(block.shape, unused=True)
         copied(self.code.work, into, block, exact=False)
@@ -248,7 +216,7 @@ class _Lanes:
     def _all(self, stream: _Stream, fixed: bool) -> Any:
         """All numbers of a table; `fixed` where they never change."""
         if self.code.is_many(stream.shape, stream.dtype):
-            return self._gathered(stream.block(self.code, stream.shape, None, fixed), fixed)
+            return self._gathered(stream.block(self.code, stream.shape, None, fixed))
         out = np.empty(stream.shape, object)
         if out.size > _MOST_GIVEN:
             raise Unsupported("many numbers that are given to every step")

@@ -59,13 +59,13 @@ class AbstractCode(Arithmetic):
         assert self.space is not None
         return self.space
 
-    def is_lane_wise(self, dual: Dual) -> bool:
-        """Whether a number is another in every lane."""
-        return isinstance(dual.value.type, ir.VectorType)
+    def moves(self, place: Dual) -> bool:
+        """Whether a place in an array is known no sooner than when the code is run, and then the same in every lane."""
+        return not isinstance(place.value, ir.Constant) and not isinstance(place.value.type, ir.VectorType)
 
     def is_many(self, shape: Sequence[int], dtype: Any) -> bool:
         """Whether an array is a block, or of one number everywhere."""
-        return self.space is not None and is_real(dtype) and math.prod(shape) >= MANY
+        return self.space is not None and is_real(dtype) and math.prod(map(int, shape)) >= MANY
 
     def block_of(self, value: Any) -> Block:
         """An array as a block."""
@@ -76,10 +76,13 @@ class AbstractCode(Arithmetic):
             copied(self.work, into, number.value, exact=False)
             return into
         for place in np.ndindex(value.shape):
-            part = into.moved(lambda layout, place=place: layout[(*(slice(k, k + 1) for k in place), ...)])
-            assert part is not None
-            copied(self.work, part, value[place].value)
+            copied(self.work, into.part(*(slice(k, k + 1) for k in place)), value[place].value)
         return into
+
+    def source(self, value: Any) -> "Block | ir.Value":
+        """What is to be copied to a block: a number, if an array is the same everywhere, or a block."""
+        number = None if isinstance(value, Block) else alike(value)
+        return self.block_of(value) if number is None else number.value
 
     def in_registers(self, value: Any) -> Any:
         """An array as one of numbers in registers."""
@@ -157,7 +160,7 @@ class AbstractCode(Arithmetic):
 
     def room_for(self, dtype: Any, shape: tuple[int, ...]) -> "AbstractTable":
         """Memory for a table that is written row by row, of what is told along a loop."""
-        if self.space is not None and is_real(dtype) and math.prod(shape):
+        if self.space is not None and is_real(dtype) and 0 not in shape:
             return BlockTable(self.space.block(shape))
         return self.room(self.kept_as(dtype), shape)
 
@@ -257,60 +260,3 @@ def alike(value: np.ndarray) -> Dual | None:
 def shaped(atom: Any) -> Any:
     """Shape and type of what stands for a value in a traced function."""
     return atom.aval
-
-
-class Cells:
-    """Values in memory, for what changes along a loop or is told by a branch."""
-
-    def __init__(self, code: AbstractCode, atoms: Sequence[Any]):
-        self.code, self.shapes, build = code, list(map(shaped, atoms)), code.builder
-        self.blocks = [code.work.block(s.shape) if code.is_many(s.shape, s.dtype) else None for s in self.shapes]
-        with build.goto_entry_block():
-            self.cells = [
-                [(build.alloca(code.kept_as(s.dtype)),
-                  build.alloca(code.register) if s.dtype == float and not code.beside else None)
-                 for _ in range(0 if block else math.prod(s.shape))]
-                for s, block in zip(self.shapes, self.blocks, strict=True)
-            ]  # fmt: skip
-        self.sloped = [np.zeros(s.shape, bool) for s in self.shapes]
-
-    def store(self, values: Sequence[Any]) -> None:
-        build = self.code.builder
-        values = [self._apart(value) for value in values]
-        for block, cells, array, sloped in zip(self.blocks, self.cells, values, self.sloped, strict=True):
-            if block is not None:
-                number = None if isinstance(array, Block) else alike(array)
-                copied(self.code.work, block, self.code.block_of(array) if number is None else number.value, exact=False)
-                continue
-            for (cell, slopes), entry, place in zip(cells, array.ravel(), np.ndindex(array.shape), strict=True):
-                build.store(self.code.fitted(entry.value, cell.type.pointee), cell)
-                if slopes is not None:
-                    build.store(self.code.slope(entry), slopes)
-                    sloped[place] |= entry.slope is not None
-
-    def _apart(self, value: Any) -> Any:
-        """A value that does not lie in these cells, of which another may be written first."""
-        own = [block.stretch for block in self.blocks if block]
-        if not isinstance(value, Block) or value.stretch not in own:
-            return value
-        into = self.code.work.block(value.shape)
-        copied(self.code.work, into, value, exact=False)
-        return into
-
-    def load(self) -> list[Any]:
-        """The values; what has had no slope wherever it was stored has none."""
-        build, out = self.code.builder, []
-        for block, cells, one, sloped in zip(self.blocks, self.cells, self.shapes, self.sloped, strict=True):
-            if block is not None:
-                out.append(block)
-                continue
-            array = np.empty(one.shape, object)
-            for (cell, slopes), place in zip(cells, np.ndindex(array.shape), strict=True):
-                array[place] = Dual(build.load(cell), build.load(slopes) if sloped[place] else None)
-            out.append(array)
-        return out
-
-    def slope_all(self) -> None:
-        """Let every real number have slopes: what a loop does to them is not known before."""
-        for sloped, one in zip(self.sloped, self.shapes, strict=True):
-            sloped[...] = one.dtype == float and not self.code.beside

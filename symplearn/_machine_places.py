@@ -89,6 +89,11 @@ def _counted(on: Any, one: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarra
     return [on.constant(np.indices(p["shape"])[p["dimension"]].astype(p["dtype"]))]
 
 
+def _nothing(on: Any, one: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
+    shaped: Any = one.outvars[0].aval
+    return [on.constant(np.zeros(shaped.shape, shaped.dtype))]
+
+
 def _reduced(name: str) -> _Place:
     def rule(on: Arithmetic, one: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
         axes = one.params["axes"]
@@ -138,6 +143,8 @@ PLACED: dict[str, _Place] = {
     "broadcast_in_dim": _spread,
     "dot_general": _contracted,
     "concatenate": lambda on, one, values: [np.concatenate(values, one.params["dimension"])],
+    # Nothing in particular: zeros, which products leave out.
+    "empty2": _nothing,
     "gather": _picked,
     "iota": _counted,
     "pad": _padded,

@@ -8,9 +8,10 @@ from jax.extend.core import ClosedJaxpr
 from llvmlite import ir
 
 from .._machine_arithmetic import DOUBLE, INTEGER, Dual
+from .._machine_cells import Cells
 from .._machine_code import Code
 from .._machine_loops import counted
-from .._machine_memory import Cells, Table
+from .._machine_memory import Table
 
 WIDTH = 8  # directions in one register
 # Rows of a table whose number is not known when its code is written; they are never counted.
