@@ -124,7 +124,9 @@ def spans_between(times: Float[np.ndarray, " time"], pieces: int, inputs: Any) -
     else:
         flat = inputs.mean_over(edges[:, :-1].ravel(), edges[:, 1:].ravel())
         values = flat.reshape(len(step), pieces, -1)
-    return Span(jnp.asarray(times[:-1]), jnp.asarray(step), jnp.asarray(values), jnp.full(len(step), pieces))
+    return Span(
+        jnp.asarray(times[:-1]), jnp.asarray(step), jnp.asarray(values), jnp.asarray(np.full(len(step), pieces))
+    )
 
 
 def _at(inputs: Any, times: np.ndarray) -> np.ndarray:

@@ -1,9 +1,9 @@
 """What the augmented simulation has at given phase points: velocities, forces, energy, readings."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
@@ -54,10 +54,10 @@ def along(
     # The last row is repeated up to the longest recording's length, so that one program serves all.
     every = np.minimum(np.arange(max(len(one.times) for one in problem.rows)), n - 1)
     moving = (states[every], rows.inputs[every], rows.times[every])
-    return np.asarray(_mapped(problem.equations, what, *map(jax.device_put, (*given, *moving))))[:n]
+    return np.asarray(_mapped(problem.equations, what, *given, *moving))[:n]
 
 
-@eqx.filter_jit
+@partial(jax.jit, static_argnums=(0, 1))
 def _mapped(equations: Any, what: Any, parameters: Array, coefficients: Array, states: Array, inputs: Array, times):
     system = Simulated(equations, parameters, coefficients)
     return jax.vmap(lambda x, u, t: what(system, x, u, t))(states, inputs, times)

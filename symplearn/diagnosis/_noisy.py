@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -90,7 +89,9 @@ def _iterate(stepper, fits: list[PathFit], priors: Priors, rows, weight, noisy: 
     """One forward pass, one step of the unknowns, one backward pass."""
     problem = stepper.problem
     passes = [_forward(stepper, fits, r, rows[r], weight[r]) for r in range(len(rows))]
-    steps = [_integrated(problem, fits[b], [(p[2], b) for p in passes], priors, weight) for b in range(LANES)]
+    told = [(np.asarray(done.gram), np.asarray(done.logs)) for _, _, done in passes]
+    steps = [_integrated(problem, fits[b], [(grams[b], logs[b]) for grams, logs in told], priors, weight)
+             for b in range(LANES)]  # fmt: skip
     moved = np.stack([fit.z + one.step for fit, one in zip(fits, steps, strict=True)])
     bounds = np.stack([priors.bounds_of(problem, fit.combination) for fit in fits])
     z = np.clip(moved, bounds[:, 0], bounds[:, 1])
@@ -99,7 +100,7 @@ def _iterate(stepper, fits: list[PathFit], priors: Priors, rows, weight, noisy: 
     squares, numbers = 0.0, 0.0
     for r, (linear, variances, done) in enumerate(passes):
         local = problem.local(r)
-        back = backward_lanes(linear, done, variances, jax.device_put(moved[:, local]))
+        back = backward_lanes(linear, done, variances, moved[:, local])
         shift = np.asarray(back.shift)[:, : rows[r]]
         used = np.stack([fit.used(r, weight[r]) for fit in fits])
         squares = squares + (used * np.asarray(back.noise)[:, : rows[r]]).sum(1)
@@ -152,14 +153,14 @@ def _pass(
         variances.append(
             padded(fit.noise**2 * np.where(used > 0, 1.0 / np.where(used > 0, used, 1.0), 0.0), length, 0.0)
         )
-    given = jax.device_put(np.stack(variances))
+    given = np.stack(variances)
     paths = np.stack([_prolonged(fit.paths[r], length) for fit in fits])
     values = np.concatenate([np.stack([fit.z[problem.head : problem.slots] for fit in fits]), slots], axis=1)
     linear = linearise(stepper, r, paths, values, hots, along, problem.rows[r].readings[:rows])
     lengths = np.asarray(course.spans.length)[:length]
     acting = np.stack([lengths * exposure(fit.exposures, r, length) for fit in fits])
     intensities = np.stack([fit.intensity for fit in fits])
-    return linear, given, forward_lanes(linear, given, jax.device_put(intensities), jax.device_put(acting))
+    return linear, given, forward_lanes(linear, given, intensities, acting)
 
 
 def _prolonged(path: np.ndarray, length: int) -> np.ndarray:
@@ -168,20 +169,19 @@ def _prolonged(path: np.ndarray, length: int) -> np.ndarray:
 
 
 def _integrated(problem: Problem, fit: PathFit, passes, priors: Priors, weight) -> Laplace:
-    """Evidence and step of one lane from its recordings' Gram matrices.
+    """Evidence and step of one lane from its recordings' Gram matrices, and logs of their innovations' variances.
 
     The columns of the state at the first row are those of x_0, so that its prior and the step are taken together.
     """
     size = 1 + problem.size
     gram, offset = np.zeros((size, size)), 0.0
-    for r, (done, b) in enumerate(passes):
+    for r, (g, logs) in enumerate(passes):
         place = np.concatenate([[0], 1 + problem.local(r)])
         # The path's first point is z's own x_0, so a step of x_0 from z is a step of the path's first point.
-        g = np.asarray(done.gram[b])
         sign = np.ones(len(place))
         sign[1:] = -1.0
         gram[np.ix_(place, place)] += g * np.outer(sign, sign)
-        offset -= 0.5 * (float(done.logs[b]) + (fit.used(r, weight[r]) > 0).sum() * np.log(2 * np.pi))
+        offset -= 0.5 * (float(logs) + (fit.used(r, weight[r]) > 0).sum() * np.log(2 * np.pi))
     if not np.isfinite(gram).all():
         return Laplace(-np.inf, np.zeros(problem.size), np.zeros((problem.size, problem.size)), 0.0)
     precision = priors.precision_of(problem, fit.combination)

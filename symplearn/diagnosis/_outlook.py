@@ -4,14 +4,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
 from .._filter import Filtered
 from .._smoother import Smoothed
-from .._triangular import semidefinite_cholesky
 from ._along import What, along, readings
 from ._bend import bent
 from ._lasting import colour_ratio, total_noise
@@ -27,11 +25,19 @@ def intensity_of(stepper: Stepper, estimate: Estimate) -> Float[np.ndarray, " d"
     return np.zeros(stepper.problem.equations.dim) if estimate.intensity is None else estimate.intensity
 
 
+def _lower_root(covariance: np.ndarray) -> np.ndarray:
+    """The lower triangular L with L L' = covariance, which may be singular; its diagonal is not negative."""
+    squares, directions = np.linalg.eigh(covariance)
+    _, upper = np.linalg.qr((directions * np.sqrt(np.maximum(squares, 0.0))).T)
+    root = upper.T
+    return root * np.where(np.diag(root) < 0, -1.0, 1.0)
+
+
 def one_off(problem: Problem, e: Estimate, recording: int, inflation: float) -> list[Float[np.ndarray, " z"]]:
     """The unknowns with one after the other of those that are no phase point off by its standard deviation."""
     local, state = problem.local(recording), problem.state
     own = np.concatenate([local[state:], local[:state]])
-    root = np.asarray(semidefinite_cholesky(jnp.asarray(e.covariance[np.ix_(own, own)] * inflation)))
+    root = _lower_root(e.covariance[np.ix_(own, own)] * inflation)
     out, c = [], problem.calibrated
     lowest = problem.lower_bounds(e.combination)
     for k in np.nonzero(np.diag(root)[: len(local) - state])[0]:

@@ -113,8 +113,9 @@ def row_roots(problem: Problem, recording: int, length: int, ratio: Float[np.nda
 
 def padded(values: Float[np.ndarray, "time ..."], length: int, fill: float) -> Float[np.ndarray, "length ..."]:
     """Rows up to `length`, so that recordings of every length share one compiled function."""
-    lack = [(0, max(0, length - len(values)))] + [(0, 0)] * (values.ndim - 1)
-    return np.pad(values, lack, constant_values=fill)[:length]
+    out = np.full((length, *values.shape[1:]), fill)
+    out[: len(values)] = values[:length]
+    return out
 
 
 def exposure(exposures: Sequence[np.ndarray] | None, r: int, length: int) -> Float[np.ndarray, " length"]:
@@ -166,7 +167,8 @@ def run_filter(
         jax.device_put(padded(readings, length, np.nan)),
         jax.device_put(row_roots(problem, recording, length, ratio)),
     )
-    return (model, spans, contexts), filtered
+    # As NumPy's: every part of JAX's that is looked at outside of compiled code is a program of its own.
+    return jax.tree.map(np.asarray, ((model, spans, contexts), filtered))
 
 
 def run_smoother(
@@ -185,7 +187,8 @@ def run_smoother(
         return linearise(stepper, recording, np.asarray(means)[None], values, hot, [np.zeros(0, int)], readings)
 
     A, H = about(filtered.filtered_means).A[0, :-1], about(filtered.predicted_means).H[0] * roots[..., None]
-    return _smooth(filtered, model.process_noise, (spans, acting), A, H, model.measurement_noise.variance)
+    smoothed = _smooth(filtered, model.process_noise, (spans, acting), A, H, model.measurement_noise.variance)
+    return jax.tree.map(np.asarray, smoothed)
 
 
 def free_run(

@@ -302,7 +302,7 @@ class Weigher:
 
     def _first_part(self, growing: list[list[int]]) -> int:
         """How many of the growing windows are affordable for every combination."""
-        pieces = int(self.problem.rows[0].spans.pieces[0])
+        pieces = int(np.asarray(self.problem.rows[0].spans.pieces)[0])
         return max(1, sum(sum(rows) * pieces <= _AFFORDABLE for rows in growing))
 
 
