@@ -1,8 +1,10 @@
 """What can go wrong in a filter's step, as a value that passes through compiled code."""
 
 import enum
+from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 # The log density, in nats, of a recording that a model cannot have made: lower than any other, and finite.
@@ -52,6 +54,6 @@ def is_remote(standardised: Float[Array, " channel"]) -> Array:
     return jnp.any(jnp.abs(standardised) > _REMOTE)
 
 
-def is_fatal(code: Int[Array, "..."]) -> Array:
+def is_fatal(code: Int[Array | np.ndarray, "..."]) -> Any:
     """Whether a code makes the result invalid."""
     return code > int(Fault.REMOTE)

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ._errors import InputError
 from ._faults import SENTENCES, Fault, is_fatal
@@ -51,7 +51,7 @@ class Filtered(eqx.Module):
     fault_step: Int[Array, ""]
 
     @property
-    def ok(self) -> Bool[Array, ""]:
+    def ok(self) -> Bool[ArrayLike, ""]:
         """Whether the filter came through: no fault, or only a remote reading."""
         return ~is_fatal(self.fault)
 

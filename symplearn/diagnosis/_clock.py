@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from ._calibrate import Fits, Priors, residuals, weights
 from ._coloured import (
@@ -61,7 +61,7 @@ class _Piece:
         return _Piece((column @ self.columns)[None, some], self.rates[some], self.weight[some], self.times[some])
 
     @cached_property
-    def rows(self) -> tuple[Array, Array, tuple[Array, Array]]:
+    def rows(self) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Factors, variances and gaps, as the filter takes them."""
         loadings = np.stack([np.ones_like(self.rates), self.rates])
         return filled(loadings), row_variances(self.weight), row_gaps(self.times)

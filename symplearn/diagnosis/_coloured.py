@@ -144,25 +144,30 @@ def _chunks(lanes: int) -> list[np.ndarray]:
     return list(places.reshape(-1, _LANES))
 
 
-def row_variances(weight: np.ndarray) -> Array:
+def row_variances(weight: np.ndarray) -> np.ndarray:
     """White variance of every row in units of one reading's; 0 marks a missing one."""
     return filled(np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0))
 
 
-def row_gaps(times: np.ndarray) -> tuple[Array, Array]:
+def row_gaps(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The different gaps that follow the rows, the first of them none, and which one follows each row."""
     gaps = np.diff(times)
     unit = float(np.median(gaps)) if len(gaps) else 1.0
     shares, places = np.unique(np.append(np.round(gaps / unit, _DIGITS), 0.0), return_inverse=True)
-    kinds = np.pad(shares * unit, (0, (1 << (len(shares) - 1).bit_length()) - len(shares)))
-    return jax.device_put(kinds), filled(places)
+    return _wide(shares * unit, 1 << (len(shares) - 1).bit_length()), filled(places)
 
 
-def filled(values: np.ndarray) -> Array:
+def filled(values: np.ndarray) -> np.ndarray:
     """Rows filled up with zeros to a round number: missing ones without gaps, which change nothing."""
     rows = max(values.shape[-1], _LEAST)
-    lack = (min(1 << (rows - 1).bit_length(), rows + -rows % _ROUND)) - values.shape[-1]
-    return jax.device_put(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, lack)]))
+    return _wide(values, min(1 << (rows - 1).bit_length(), rows + -rows % _ROUND))
+
+
+def _wide(values: np.ndarray, width: int) -> np.ndarray:
+    """So many entries along the last axis, zeros after those that there are."""
+    out = np.zeros((*values.shape[:-1], width), values.dtype)
+    out[..., : values.shape[-1]] = values
+    return out
 
 
 def grid_of(times: list[np.ndarray], dampings: Sequence[float] = _DAMPINGS, number: int = _TIMES) -> np.ndarray:
@@ -186,7 +191,7 @@ def fit_colour(
     signal would explain everything and mean nothing.
     """
     grid = grid_of(times)
-    ratio, frequency, damping = (jax.device_put(grid[:, i]) for i in range(3))
+    ratio, frequency, damping = grid.T
     square: Any = 0.0
     logs: Any = 0.0
     number = 0
@@ -222,7 +227,7 @@ def whitened_gram(
     """Gram matrix of the whitened columns in units of the white variance, and the sum of log innovation variances."""
     shape = [np.array([getattr(c, f) for c in colours]) for f in ("ratio", "frequency", "damping")]
     rows = row_variances(weight), row_gaps(times)
-    parts = [_grams(filled(columns[c]), *rows, *(jax.device_put(s[c]) for s in shape)) for c in _chunks(len(columns))]
+    parts = [_grams(filled(columns[c]), *rows, *(s[c] for s in shape)) for c in _chunks(len(columns))]
     total, logs = (np.concatenate([np.asarray(part[i]) for part in parts])[: len(columns)] for i in range(2))
     return total, logs
 
@@ -236,7 +241,7 @@ def whitened_residuals(
     """Every lane's residuals whitened by its own colour, in units of its white sd."""
     shape = [np.array([getattr(c, f) for c in colours]) for f in ("ratio", "frequency", "damping")]
     rows = row_variances(weight), row_gaps(times)
-    parts = [_lanes(filled(residuals[c][:, None]), *rows, *(jax.device_put(s[c]) for s in shape))[0]
+    parts = [_lanes(filled(residuals[c][:, None]), *rows, *(s[c] for s in shape))[0]
              for c in _chunks(len(residuals))]  # fmt: skip
     return np.concatenate([np.asarray(part)[..., 0] for part in parts])[: len(residuals), : len(times)]
 
@@ -248,5 +253,5 @@ def whitened_series(
     colour: Colour,
 ) -> Float[np.ndarray, "time column"]:
     """The whitened columns of one lane, row by row, in units of the white sd."""
-    shape = (jax.device_put(x) for x in (colour.ratio, colour.frequency, colour.damping))
+    shape = colour.ratio, colour.frequency, colour.damping
     return np.asarray(_series(filled(columns), row_variances(weight), row_gaps(times), *shape)[0])[: len(times)]

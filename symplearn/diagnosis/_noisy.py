@@ -157,7 +157,7 @@ def _pass(
     paths = np.stack([_prolonged(fit.paths[r], length) for fit in fits])
     values = np.concatenate([np.stack([fit.z[problem.head : problem.slots] for fit in fits]), slots], axis=1)
     linear = linearise(stepper, r, paths, values, hots, along, problem.rows[r].readings[:rows])
-    lengths = np.asarray(course.spans.length)[:length]
+    lengths = (np.asarray(course.spans.step) * np.asarray(course.spans.pieces))[:length]
     acting = np.stack([lengths * exposure(fit.exposures, r, length) for fit in fits])
     intensities = np.stack([fit.intensity for fit in fits])
     return linear, given, forward_lanes(linear, given, intensities, acting)
@@ -214,4 +214,4 @@ def lane_grams(
     done = _pass(stepper, [fit] * LANES, r, rows[r], weight, *given)[2]
     sign = np.ones(done.gram.shape[-1])
     sign[1:] = -1.0
-    return [np.asarray(done.gram[b]) * np.outer(sign, sign) for b in range(number)]
+    return list(np.asarray(done.gram)[:number] * np.outer(sign, sign))

@@ -105,7 +105,7 @@ class Prospects:
     def _units(self, most: int, sharp: Mapping[int, list[Unit]] | None = None) -> list[Unit]:
         """What is tried: every effect and target at its `sharp` places, or at all, thinned to so many at most."""
         problem, out = self.weigher.problem, list[Unit]()
-        substeps = sum(self.weigher.rows) * int(problem.rows[0].spans.pieces[0])
+        substeps = sum(self.weigher.rows) * int(np.asarray(problem.rows[0].spans.pieces)[0])
         load = substeps * (1 if problem.equations.separable else _NONSEPARABLE) / _CHEAP
         most = max(_LEAST, int(most / max(1.0, load)))
         for c in problem.searched:

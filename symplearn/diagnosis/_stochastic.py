@@ -183,10 +183,11 @@ def run_smoother(
     values = np.concatenate([z[problem.head : problem.slots], np.zeros(SLOTS)])[None]
     readings = np.where(np.asarray(filtered.observed), 0.0, np.nan)
 
-    def about(means: Array) -> Linear:
-        return linearise(stepper, recording, np.asarray(means)[None], values, hot, [np.zeros(0, int)], readings)
+    def about(means: np.ndarray) -> Linear:
+        return linearise(stepper, recording, means[None], values, hot, [np.zeros(0, int)], readings)
 
-    A, H = about(filtered.filtered_means).A[0, :-1], about(filtered.predicted_means).H[0] * roots[..., None]
+    A = about(np.asarray(filtered.filtered_means)).A[0, :-1]
+    H = about(np.asarray(filtered.predicted_means)).H[0] * roots[..., None]
     smoothed = _smooth(filtered, model.process_noise, (spans, acting), A, H, model.measurement_noise.variance)
     return jax.tree.map(np.asarray, smoothed)
 
