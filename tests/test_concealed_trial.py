@@ -131,7 +131,8 @@ def test_the_diagnosis_sees_two_files(trial):
     assert found["status"] == "done" and found["seconds"] > 0
     assert found["document"]["seen"] == ["recording.csv", "simulation.toml"]
     # The first recording's last reading is at 3, its step 1, its readings four.
-    assert found["document"]["arguments"][-4:] == ["--forecast-until", "4.0", "--jobs", "2"]
+    asked = ["--forecast-until", "4.0", "--forecast-step", "0.25", "--jobs", "2"]
+    assert found["document"]["arguments"][-6:] == asked
     assert found["forecast"] == {"t": [1.0], "y_after": [2.0]}
 
 
