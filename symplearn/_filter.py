@@ -7,6 +7,7 @@ squared norm. The filter carries a square root of the state's covariance, which 
 
 import functools
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -138,7 +139,7 @@ def log_likelihood(
     arrays, rest = eqx.partition((model, readings, intervals, contexts, transform, passage), eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
 
-    def of(*leaves: Array) -> Array:
+    def of(*leaves: Any) -> Array:
         *given, transform, passage = eqx.combine(jax.tree.unflatten(structure, leaves), rest)
         return passage.run(*given, transform, keep=False)[0].log_likelihood
 

@@ -18,14 +18,14 @@ def with_swift_slopes(function: Callable[..., Array]) -> Callable[..., Array]:
     """
 
     @jax.custom_jvp
-    def swift(*args: Array) -> Array:
+    def swift(*args: Any) -> Array:
         return with_lane_loops(function)(*args)
 
-    def rule(primals: Sequence[Array], tangents: Sequence[Any]) -> tuple[Array, Array]:
+    def rule(primals: Sequence[Any], tangents: Sequence[Any]) -> tuple[Any, Any]:  # JAX has numbers among them
         moved = [k for k, one in enumerate(tangents) if _moves(one)]
         along = [tangents[k] for k in moved]
 
-        def of(*some: Array) -> Array:
+        def of(*some: Any) -> Array:
             all_of = dict(enumerate(primals)) | dict(zip(moved, some, strict=True))
             return function(*(all_of[k] for k in range(len(primals))))
 
