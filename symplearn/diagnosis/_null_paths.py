@@ -95,6 +95,6 @@ def filtered_path(stepper: Stepper, rows: Sequence[int], r: int, z: np.ndarray, 
     _, filtered = run_filter(
         problem, course, r, z, (), noise, 0 * noise, strong, spread, problem.rows[r].readings[: rows[r]]
     )
-    means = np.array(filtered.filtered_means[: rows[r]])
+    means = np.array(filtered.filtered_means)[: rows[r]]
     means[0] = x
     return means if bool(filtered.ok) else np.tile(x, (rows[r], 1))

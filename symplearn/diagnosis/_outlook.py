@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
@@ -19,6 +20,9 @@ from ._stochastic import free_run, row_roots, run_filter, run_smoother
 from ._trajectory import Stepper
 from ._weighed import Estimate
 
+# A pivot of this part of its variance is round-off.
+_SPENT = 1e-14
+
 
 def intensity_of(stepper: Stepper, estimate: Estimate) -> Float[np.ndarray, " d"]:
     """Intensity of the missing force, zero where the remainder is not one."""
@@ -26,11 +30,13 @@ def intensity_of(stepper: Stepper, estimate: Estimate) -> Float[np.ndarray, " d"
 
 
 def _lower_root(covariance: np.ndarray) -> np.ndarray:
-    """The lower triangular L with L L' = covariance, which may be singular; its diagonal is not negative."""
-    squares, directions = np.linalg.eigh(covariance)
-    _, upper = np.linalg.qr((directions * np.sqrt(np.maximum(squares, 0.0))).T)
-    root = upper.T
-    return root * np.where(np.diag(root) < 0, -1.0, 1.0)
+    """The lower triangular L with L L' = covariance; a column of zeros where nothing is left of a variance."""
+    rest, out = covariance.copy(), np.zeros_like(covariance)
+    for k, variance in enumerate(np.diag(covariance)):
+        if rest[k, k] > _SPENT * variance:
+            out[k:, k] = rest[k:, k] / np.sqrt(rest[k, k])
+            rest -= np.outer(out[:, k], out[:, k])
+    return out
 
 
 def one_off(problem: Problem, e: Estimate, recording: int, inflation: float) -> list[Float[np.ndarray, " z"]]:
@@ -67,11 +73,13 @@ class Outlook:
     @cached_property
     def _filtered(self) -> tuple[Any, Filtered]:
         e, r = self.estimate, self.recording
-        return run_filter(
+        given, filtered = run_filter(
             self.stepper.problem, self.stepper.courses[r], r, e.z, e.combination, total_noise(e), colour_ratio(e),
             self.intensity, self._start_spread, self._straight[: self.rows.fitted],
             self.exposures,
         )  # fmt: skip
+        # As NumPy's: every part of JAX's that is looked at outside of compiled code is a program of its own.
+        return given, jax.tree.map(np.asarray, filtered)
 
     @cached_property
     def _straight(self) -> Float[np.ndarray, "time channel"]:

@@ -167,8 +167,7 @@ def run_filter(
         jax.device_put(padded(readings, length, np.nan)),
         jax.device_put(row_roots(problem, recording, length, ratio)),
     )
-    # As NumPy's: every part of JAX's that is looked at outside of compiled code is a program of its own.
-    return jax.tree.map(np.asarray, ((model, spans, contexts), filtered))
+    return (model, spans, contexts), filtered
 
 
 def run_smoother(
@@ -187,7 +186,7 @@ def run_smoother(
         return linearise(stepper, recording, means[None], values, hot, [np.zeros(0, int)], readings)
 
     A = about(np.asarray(filtered.filtered_means)).A[0, :-1]
-    H = about(np.asarray(filtered.predicted_means)).H[0] * roots[..., None]
+    H = about(np.asarray(filtered.predicted_means)).H[0] * np.asarray(roots)[..., None]
     smoothed = _smooth(filtered, model.process_noise, (spans, acting), A, H, model.measurement_noise.variance)
     return jax.tree.map(np.asarray, smoothed)
 
