@@ -9,7 +9,7 @@ from typing import Any
 
 from llvmlite import ir
 
-from ._machine_arithmetic import INTEGER, SHORT, Arithmetic, Dual, Unsupported
+from ._machine_arithmetic import INTEGER, SHORT, Arithmetic, Dual
 from ._machine_blocks import Block, Side, Workspace, pointers
 from ._machine_loops import counted
 
@@ -89,10 +89,16 @@ def _product(writer: "_Writer", sizes: tuple[int, int, int], sides: Sequence[Sid
     tall = count if count <= _ROWS + 1 else _ROWS
     for first, number, step in _parts(count, tall):
         with writer.counting(first, number, step) as i:
-            for begin, many, wide in _parts(registers, min(registers, _COLUMNS)):
-                with writer.counting(begin, many, wide) as j:
-                    last = begin + many * wide == registers
-                    _part(writer, along, (i, step), (j, wide), sides, places, width if last else None)
+            *inner, (begin, many, wide) = _parts(registers, min(registers, _COLUMNS))
+            # The last register of a row may be filled in part.
+            for first_of, number_of, columns, rest in (
+                *((*part, None) for part in inner),
+                (begin, many - 1, wide, None),
+                (begin + (many - 1) * wide, 1, wide, width),
+            ):
+                if number_of:
+                    with writer.counting(first_of, number_of, columns) as j:
+                        _part(writer, along, (i, step), (j, columns), sides, places, rest)
 
 
 def _part(
@@ -234,8 +240,6 @@ class _Writer:
     ) -> None:
         """Write one entry of all lanes, or so many entries along the last axis."""
         place, stride = self._place(side, begin, at), side.strides[-1]
-        if side.alone:
-            raise Unsupported("lanes that are written to one place")
         if self.lanes > 1 or (stride == 1 and (count == self.step or not exact)):
             self.build.store(value, self.build.bitcast(place, self.math.register.as_pointer()), align=8)
             return

@@ -19,6 +19,7 @@ RNG = np.random.default_rng(4)
 W, B = RNG.normal(size=(SIZE, SIZE)) / np.sqrt(SIZE), RNG.normal(size=SIZE)
 LEAST = RNG.normal(size=(2, 3, SIZE)) / np.sqrt(SIZE)
 PLACES = np.arange(7)
+TIMES = np.linspace(0.5, 1.5, 7)
 
 
 def points(c):
@@ -101,6 +102,21 @@ def test_a_networks_likelihood_and_gradient_are_those_of_xla(way, monkeypatch):
     with left_to_xla():
         expected = jax.jit(jax.vmap(lambda *some: both(*some)))(*at)
     same(found, expected, 1e-10)  # issue 7 asks for 1e-10 of every fast path
+
+
+@pytest.mark.parametrize("size", [1, 7, 31, 33, 61, 64, 70])
+def test_products_of_every_width_are_those_of_xla(size, monkeypatch):
+    """Matrices whose rows fill their last register in part, or end within one of several that are held at once; what is
+    given lies end to end, with nothing behind it."""
+    left, right = RNG.normal(size=(9, 11)), RNG.normal(size=(11, size)) / np.sqrt(max(size, 11))
+    monkeypatch.setattr(_machine_lanes, "_LARGE", 0)
+
+    def function(given, x):
+        return lax.scan(lambda c, k: (jnp.sin(k * (c @ x) @ x.T), (c @ x)[2] * k), given, TIMES)
+
+    names, x = counted(monkeypatch), jnp.asarray(right)
+    same(jax.jit(with_lane_loops(function))(left, x), jax.jit(function)(left, x), 10 * ROUND_OFF)
+    assert names and None not in names
 
 
 def test_a_network_of_ones_own_is_written():
