@@ -49,6 +49,11 @@ class AbstractSteps(abc.ABC):
 
     courses: Sequence[Course]
 
+    @property
+    def is_quick(self) -> bool:
+        """Whether stepping takes so little beside the rest that threads of its own would only wait for each other."""
+        return False
+
     @abc.abstractmethod
     def __call__(self, problem: Problem, runs: Sequence[Lanes]) -> list[Found]:
         """What is found of each run."""

@@ -82,8 +82,9 @@ class Stepper:
         return Predictions(found.shown[order, :, : p.channels], slopes[order])
 
     def ahead(self, work: Callable[[A], B], items: Sequence[A]) -> Iterator[B]:
-        """The work on every item in order, on all threads while what comes before is being used."""
-        return self.threads.ahead(work, items)
+        """The work on every item in order, on all threads while what comes before is being used; where stepping is
+        quick, when its turn comes."""
+        return map(work, items) if self.steps.is_quick else self.threads.ahead(work, items)
 
     def responses(
         self, z: Float[np.ndarray, " z"], combination: Combination, laid: Sequence[Any], rows: int, r: int
