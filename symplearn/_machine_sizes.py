@@ -17,7 +17,7 @@ _WORTH_COPIES = 8
 
 
 def largest_array(program: Jaxpr) -> int:
-    """Of the largest array in a traced function."""
+    """Entries of the largest array in a traced function."""
     own = [math.prod(shaped(atom).shape) for one in program.eqns for atom in (*one.invars, *one.outvars)]
     return max([0, *own, *(largest_array(inner) for one in program.eqns for inner in programs_in(one))])
 

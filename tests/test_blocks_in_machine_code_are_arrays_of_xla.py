@@ -80,6 +80,7 @@ def test_steps_are_those_of_xla(name, way, lanes, monkeypatch):
         function = jax.grad(lambda x: sum(jnp.sum(jnp.sin(one)) for one in plain(x)))
     names, x = counted(monkeypatch), jnp.asarray(RNG.normal(size=(lanes, SIZE)))
     mapped = jax.vmap if lanes > 1 else (lambda one: lambda some: one(some[0]))
+    # Sums of forty products, seven steps long, in an order of their own.
     same(jax.jit(mapped(with_lane_loops(function)))(x), jax.jit(mapped(function))(x), 10 * ROUND_OFF)
     assert names and None not in names
 
@@ -115,6 +116,7 @@ def test_products_of_every_width_are_those_of_xla(size, monkeypatch):
         return lax.scan(lambda c, k: (jnp.sin(k * (c @ x) @ x.T), (c @ x)[2] * k), given, TIMES)
 
     names, x = counted(monkeypatch), jnp.asarray(right)
+    # As above: sums in an order of their own, over seven steps.
     same(jax.jit(with_lane_loops(function))(left, x), jax.jit(function)(left, x), 10 * ROUND_OFF)
     assert names and None not in names
 
@@ -161,6 +163,7 @@ def test_exponentials_are_right_everywhere(lanes, monkeypatch):
     with np.errstate(over="ignore"):
         expected = np.exp(x)
     tiny = expected < 1e-307  # below the smallest normal number zero will do
+    # Two units in the last place: the series' and the last product's rounding, against the library's own.
     np.testing.assert_allclose(np.where(tiny, 0.0, found), np.where(tiny, 0.0, expected), rtol=4e-16)
     assert np.all(found[tiny] <= 1e-307)
     assert names and None not in names

@@ -10,6 +10,7 @@ from machine_operations import OF_ONE, POINT
 import integrators as ig
 import symplearn as sl
 from benchmarks._cases import cherry, henon_heiles
+from experiments._calibration_models import Pendulum
 from symplearn import _filter, _lane_loops, _machine_lanes, _native
 from symplearn._filter import SEQUENTIAL
 from symplearn._lane_loops import left_to_xla, with_lane_loops
@@ -218,7 +219,8 @@ def test_a_lane_that_fails_spoils_no_other():
     score = with_lane_loops(lambda free: case.score(free, case.series.readings))
     found = np.asarray(jax.jit(jax.vmap(score))(places))
     assert found[3] == 1e15
-    # One lane's sums are in the order of eight lanes', but fused in other places: round-off.
+    # One lane's sums are in the order of eight lanes', but fused in other places, so they differ by round-off, the reason
+    # of which stands at ROUND_OFF.
     np.testing.assert_allclose(np.delete(found, 3), case.score(case.free, case.series.readings), rtol=ROUND_OFF)
 
 
@@ -242,16 +244,6 @@ def cache_folder(tmp_path):
 
 def test_a_model_of_ones_own_that_reads_one_coordinate_is_written():
     """The filter of a Hamiltonian that a user wrote, where one coordinate is read, is machine code there and back."""
-
-    class Pendulum(ig.AbstractSeparableHamiltonian):
-        gravity: jax.Array
-
-        def kinetic(self, p):
-            return 0.5 * p @ p
-
-        def potential(self, q):
-            return -self.gravity * jnp.sum(jnp.cos(q))
-
     noise = sl.AdditiveGaussian(sl.ScaledIdentity(0.01, 2)), sl.AdditiveGaussian(sl.ScaledIdentity(0.01, 1))
     start, recording = sl.Gaussian(jnp.ones(2), jnp.eye(2)), sl.TimeSeries(0.2 * np.arange(60), jnp.ones((60, 1)))
 
