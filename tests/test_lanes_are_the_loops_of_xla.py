@@ -219,8 +219,8 @@ def test_a_lane_that_fails_spoils_no_other():
     score = with_lane_loops(lambda free: case.score(free, case.series.readings))
     found = np.asarray(jax.jit(jax.vmap(score))(places))
     assert found[3] == 1e15
-    # One lane's sums are in the order of eight lanes', but fused in other places, so they differ by round-off, the reason
-    # of which stands at ROUND_OFF.
+    # One lane's sums are in the order of eight lanes', but fused in other places: they differ by round-off, whose bound
+    # has its reason at ROUND_OFF.
     np.testing.assert_allclose(np.delete(found, 3), case.score(case.free, case.series.readings), rtol=ROUND_OFF)
 
 
