@@ -9,6 +9,7 @@ from numpy.polynomial import Legendre
 from scipy.stats import norm, t
 
 from symplearn import _effects as effects
+from symplearn.diagnosis._bend import Shapes
 from symplearn.diagnosis._calibrate import calibrate
 from symplearn.diagnosis._clock import weigh_clock
 from symplearn.diagnosis._forecast import forecast
@@ -42,11 +43,11 @@ def test_the_error_is_what_a_dense_process_expects(ratio):
     seen, root = rng.uniform(-2.0, 3.0, 50), np.sqrt(rng.uniform(0.5, 20.0, 50))
     shapes = np.stack([np.sqrt(2 * k + 1) * Legendre.basis(k)(2 * (seen + 2) / 5 - 1) for k in range(13)])
     columns, column = rng.normal(size=(4, 50)) * root, rng.normal(size=4)
-    one = _Channel(np.concatenate([columns, shapes * root]), 4, np.ones(50, bool), 0.7, (-2.0, 3.0))
+    one = _Channel(np.concatenate([columns, shapes * root]), 4, np.ones(50, bool), 0.7, Shapes((-2.0, 3.0)))
     found, prior = one.bend(column, ratio, 0.3), ratio / 13 * shapes.T @ shapes
     taken = prior @ np.linalg.inv(prior + np.diag(1 / root**2))
     # 1e-9, here and below: round-off of two ways to solve, with a matrix of condition 4000.
-    np.testing.assert_allclose(found(seen), taken @ (column @ columns / root), rtol=1e-9)
+    np.testing.assert_allclose(found(seen, np.arange(50.0)), taken @ (column @ columns / root), rtol=1e-9)
     left = np.average(np.diag(prior - taken @ prior), weights=root**2)
     assert found.spread == pytest.approx(0.3 * np.sqrt(left), rel=1e-9)
 

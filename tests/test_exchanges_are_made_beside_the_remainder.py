@@ -53,22 +53,29 @@ def covariances(kind, fits, weight, times):
     S, first = np.zeros((total, total)), 0
     for t, rate in zip(times, rates, strict=True):
         own = slice(first, first + len(t))
-        if kind != "positional":
+        if kind in ("coloured", "clock"):
             S[own, own] = COLOUR.ratio * autocovariance(t[:, None] - t, COLOUR.frequency, COLOUR.damping)
         if kind == "clock":
             late = CLOCK.ratio * autocovariance(t[:, None] - t, CLOCK.frequency, CLOCK.damping)
             S[own, own] += np.outer(rate, rate) * late / size**2
         first += len(t)
     seen = np.concatenate(weight) > 0
-    if kind == "positional":  # thirteen polynomials over the range that was read, of equal variances
-        x = np.concatenate(shown)
-        place = 2 * (x - x[seen].min()) / np.ptp(x[seen]) - 1
-        shapes = np.stack([np.sqrt(2 * k + 1) * Legendre.basis(k)(place) for k in range(13)])
-        S = BENT * shapes.T @ shapes / 13
+    if kind in ("positional", "kinematic"):
+        shapes = thirteen(np.concatenate(shown), seen)
+        if kind == "kinematic":
+            moving = [np.gradient(x, t, edge_order=2) for x, t in zip(shown, times, strict=True)]
+            shapes = np.concatenate([shapes, thirteen(np.concatenate(moving), seen)[1:]])
+        S = BENT * shapes.T @ shapes / len(shapes)
     return S[np.ix_(seen, seen)] + np.diag(1 / np.concatenate(weight)[seen]), seen
 
 
-@pytest.mark.parametrize("kind", ["coloured", "clock", "positional"])
+def thirteen(x, seen):
+    """Polynomials over the range that was read, of equal variances."""
+    place = np.clip(2 * (x - x[seen].min()) / np.ptp(x[seen]) - 1, -1.0, 1.0)
+    return np.stack([np.sqrt(2 * k + 1) * Legendre.basis(k)(place) for k in range(13)])
+
+
+@pytest.mark.parametrize("kind", ["coloured", "clock", "positional", "kinematic"])
 def test_products_of_whitened_columns_are_the_dense_gaussian_process(kind, fitted):
     """For every kind of remainder, two recordings at irregular times with readings missing: NumPy's solution with the
     covariance of all readings."""

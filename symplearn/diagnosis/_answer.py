@@ -44,6 +44,7 @@ _WAYS = {
     "coloured": "that remembers itself",
     "clock": "that goes with how fast they change, as where they are read too early or too late",
     "positional": "that goes with what is read",
+    "kinematic": "that goes with what is read and how fast that changes",
     "jitter": "that is larger the faster they change, as where single times are a little off",
 }
 

@@ -1,14 +1,65 @@
-"""An error of the sensor that goes with what it reads, as far as it is known."""
+"""An error of the sensor that goes with what it reads, and maybe with how fast that changes, as far as it is known."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.polynomial.legendre import legvander
 
 # Polynomials up to this degree.
 _DEGREE = 12
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """What such an error is a sum of: polynomials over the range of what is read, and with `speeds` over that of its
+    rate of change too."""
+
+    readings: tuple[float, float]
+    speeds: tuple[float, float] | None = None
+
+    @classmethod
+    def over(
+        cls, expected: Sequence[Float[np.ndarray, " _"]], times: Sequence[Float[np.ndarray, " _"]],
+        seen: Bool[np.ndarray, " row"], moving: bool,
+    ) -> "Shapes":  # fmt: skip
+        """Those of what is read in some recordings, end to end, and with `moving` of its rates."""
+        speeds = [rate(x, t) for x, t in zip(expected, times, strict=True)]
+        return cls(_ends(np.concatenate(expected), seen), _ends(np.concatenate(speeds), seen) if moving else None)
+
+    def __call__(
+        self, expected: Float[np.ndarray, "*batch row"], times: Float[np.ndarray, " row"]
+    ) -> Float[np.ndarray, "*batch row shape"]:
+        shapes = polynomials(expected, *self.readings)
+        if self.speeds is None:
+            return shapes
+        # A constant error is among those of place.
+        return np.concatenate([shapes, polynomials(rate(expected, times), *self.speeds)[..., 1:]], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Bend:
+    """The error of one channel: the mean of its shapes' coefficients, and the rms over the rows of the sd that is left
+    of it."""
+
+    shapes: Shapes
+    coefficients: Float[np.ndarray, " shape"]
+    spread: float
+
+    def __call__(
+        self, expected: Float[np.ndarray, "*batch row"], times: Float[np.ndarray, " row"]
+    ) -> Float[np.ndarray, "*batch row"]:
+        found: np.ndarray = self.shapes(expected, times) @ self.coefficients
+        return found
+
+
+def bent(
+    expected: Float[np.ndarray, "*batch row channel"], times: Float[np.ndarray, " row"], bends: Sequence[Bend]
+) -> Float[np.ndarray, "*batch row channel"]:
+    """What is read where this is expected at these times; the same where there are no bends."""
+    return expected + sum(one(expected[..., j], times)[..., None] * (np.arange(expected.shape[-1]) == j)
+                          for j, one in enumerate(bends))  # fmt: skip
 
 
 def polynomials(expected: Float[np.ndarray, "*row"], low: float, high: float) -> Float[np.ndarray, "*row degree"]:
@@ -18,22 +69,17 @@ def polynomials(expected: Float[np.ndarray, "*row"], low: float, high: float) ->
     return shapes
 
 
-@dataclass(frozen=True, eq=False)
-class Bend:
-    """The error of one channel by what it reads from `low` to `high`: the mean of the polynomials' coefficients, and
-    the rms over the rows of the sd that is left of it."""
-
-    low: float
-    high: float
-    coefficients: Float[np.ndarray, " degree"]
-    spread: float
-
-    def __call__(self, expected: Float[np.ndarray, "*row"]) -> Float[np.ndarray, "*row"]:
-        found: np.ndarray = polynomials(expected, self.low, self.high) @ self.coefficients
-        return found
+def rate(
+    expected: Float[np.ndarray, "*batch row"], times: Float[np.ndarray, " row"]
+) -> Float[np.ndarray, "*batch row"]:
+    """How fast something changes that is expected at these times; zero where there is one time alone."""
+    if len(times) < 2:
+        return np.zeros_like(expected)
+    found: np.ndarray = np.gradient(expected, times, axis=-1, edge_order=2 if len(times) > 2 else 1)
+    return found
 
 
-def bent(expected: Float[np.ndarray, "*row channel"], bends: Sequence[Bend]) -> Float[np.ndarray, "*row channel"]:
-    """What is read where this is expected; the same where there are no bends."""
-    return expected + sum(one(expected[..., j])[..., None] * (np.arange(expected.shape[-1]) == j)
-                          for j, one in enumerate(bends))  # fmt: skip
+def _ends(expected: Float[np.ndarray, " row"], seen: Bool[np.ndarray, " row"]) -> tuple[float, float]:
+    """The range of something where it is seen."""
+    some = expected[seen & np.isfinite(expected)] if seen.any() else np.zeros(1)
+    return (float(some.min()), float(some.max())) if len(some) else (0.0, 0.0)

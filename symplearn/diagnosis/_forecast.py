@@ -89,7 +89,7 @@ def _expected(
     pushed = intensity_of(stepper, e) * (e.exposures is None)
     drawn = _run_on(*_model(stepper), zs, ends, jnp.asarray(stepper.problem.onehot(e.combination, 0)),
                     jnp.asarray(pushed), ahead, jax.random.split(push_key, len(units)))  # fmt: skip
-    return _summary(bent(np.asarray(drawn), e.bends), log_weights, about_first=e.intensity is None)
+    return _summary(bent(np.asarray(drawn), times, e.bends), log_weights, about_first=e.intensity is None)
 
 
 def _model(stepper: Stepper) -> tuple[Any, Any, Any]:
@@ -101,12 +101,12 @@ def _by_all_rows(
     stepper: Stepper, e: Estimate, root: np.ndarray, units: Float[np.ndarray, "draw local"]
 ) -> tuple[Array, Array, Float[np.ndarray, " draw"]]:
     """Draws given all rows, their phase points at the last one, and log weights; the first is the most probable one."""
-    problem, given = stepper.problem, stepper.problem.rows[0].readings
+    problem, rows = stepper.problem, stepper.problem.rows[0]
     known = taught(stepper, e, root)
     zs = jnp.asarray(_within(problem, known.mean + units @ known.root.T))
     seen, states = _run_through(*_model(stepper), zs, jnp.asarray(problem.onehot(e.combination, 0)))
-    log_weights = known.log_weights(units, bent(np.asarray(seen)[:, : len(given)], e.bends), given)
-    return zs, states[:, len(given) - 1], log_weights
+    shown = bent(np.asarray(seen)[:, : len(rows.times)], rows.times, e.bends)
+    return zs, states[:, len(rows.times) - 1], known.log_weights(units, shown, rows.readings)
 
 
 def _filtered(stepper: Stepper, e: Estimate, zs: Array, key: Array) -> Array:

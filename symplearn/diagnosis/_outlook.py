@@ -87,7 +87,7 @@ class Outlook:
         if not self.estimate.bends:
             return self.rows.readings
         expected = self._run(self._begin, 0)[0]
-        return self.rows.readings - np.nan_to_num(bent(expected, self.estimate.bends) - expected)
+        return self.rows.readings - np.nan_to_num(bent(expected, self.rows.times, self.estimate.bends) - expected)
 
     @cached_property
     def _start_spread(self) -> Float[np.ndarray, "state state"]:
@@ -129,13 +129,14 @@ class Outlook:
     @cached_property
     def run(self) -> Float[np.ndarray, "row channel"]:
         """Readings of the free run, from the last fitted row on."""
-        return bent(self._run(self.last_state, self.rows.fitted - 1)[0], self.estimate.bends)
+        last = self.rows.fitted - 1
+        return bent(self._run(self.last_state, last)[0], self.rows.times[last:], self.estimate.bends)
 
     @cached_property
     def followed(self) -> Float[np.ndarray, "fitted channel"]:
         """Readings of the filtered phase points over the fitted rows."""
         means = np.asarray(self._filtered[1].filtered_means[: self.rows.fitted])
-        return bent(self.along(readings, means), self.estimate.bends)
+        return bent(self.along(readings, means), self.rows.times[: self.rows.fitted], self.estimate.bends)
 
     def along(self, what: What, states: Float[np.ndarray, "row state"]) -> np.ndarray:
         """Something that the augmented simulation has at phase points of the leading rows."""

@@ -3,6 +3,9 @@
 Such an error repeats with the motion, and its harmonics look like forces at twice and four times the frequency. It is a
 random function of the reading: Legendre polynomials with independent coefficients of one variance, which enter in
 proportion and are integrated out. A bias or a gain alone has a name of its own, and fewer unknowns to pay for.
+
+What a camera sees or a gear with play turns is off by another amount on the way back: such an error goes with the
+reading's rate of change as well (the kind `kinematic`), by polynomials of that.
 """
 
 from collections.abc import Sequence
@@ -13,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ._bearers import Left, Sizes, borne, largest, log_likelihood, sizes
-from ._bend import Bend, polynomials
+from ._bend import Bend, Shapes
 from ._calibrate import Fits, Priors, residuals, weights
 from ._evidence import variance_inflation
 from ._problem import Problem
@@ -26,13 +29,13 @@ _RATIOS = np.geomspace(0.03, 1e4, 12)
 
 @dataclass(frozen=True, eq=False)
 class _Channel:
-    """Columns [error, slopes, polynomials] of one channel, all recordings end to end, in units of one reading."""
+    """Columns [error, slopes, shapes] of one channel, all recordings end to end, in units of one reading."""
 
     columns: Float[np.ndarray, "column row"]
-    plain: int  # columns that are no polynomials
+    plain: int  # columns that are no shapes
     seen: Bool[np.ndarray, " row"]
     log_weights: float
-    ends: tuple[float, float] = (0.0, 1.0)  # of what is read
+    shapes: Shapes = Shapes((0.0, 1.0))
 
     @property
     def number(self) -> int:
@@ -45,14 +48,14 @@ class _Channel:
         return self.columns @ self.columns.T
 
     def marginal(self, ratio: float) -> tuple[np.ndarray, float]:
-        """Gram matrix of the plain columns with the polynomials integrated out, and the log determinant they leave."""
+        """Gram matrix of the plain columns with the shapes integrated out, and the log determinant they leave."""
         number = len(self.columns) - self.plain
         unit = np.where(np.arange(len(self.columns)) < self.plain, 1.0, np.sqrt(ratio / number))
         gram, _, log = amplitudes_out(self.gram * np.outer(unit, unit), self.plain)
         return gram, log - self.log_weights
 
     def cleared(self, ratio: float) -> Float[np.ndarray, "column row"]:
-        """The plain columns without what the polynomials take of them."""
+        """The plain columns without what the shapes take of them."""
         rest = self.columns[self.plain :]
         held = rest @ rest.T + np.eye(len(rest)) * len(rest) / ratio
         plain = self.columns[: self.plain]
@@ -64,58 +67,60 @@ class _Channel:
         spread = np.linalg.inv(rest @ rest.T + np.eye(len(rest)) * len(rest) / ratio)
         mean = spread @ (rest @ (column @ self.columns[: self.plain]))
         square = float((rest * (spread @ rest)).sum()) / max(float((rest[0] ** 2).sum()), 1e-300)
-        return Bend(*self.ends, mean, noise * float(np.sqrt(max(square, 0.0))))
+        return Bend(self.shapes, mean, noise * float(np.sqrt(max(square, 0.0))))
 
 
 @np.errstate(all="ignore")  # a lane that diverged is told by its evidence
-def weigh_positional(problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int]) -> list[Estimate]:
-    """Estimates where each channel's error goes with what it reads, about the trajectory fit.
+def weigh_positional(
+    problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int], moving: bool = False
+) -> list[Estimate]:
+    """Estimates where each channel's error goes with what it reads, about the trajectory fit; with `moving` with how
+    fast that changes, too.
 
     Of a combination with a wrongly given noise, too: no such error is as rough as noise.
     """
     out = []
     for b, combination in enumerate(fits.combinations):
         known = problem.noise_of(combination)
-        channels = [_channel(problem, fits, b, rows, j) for j in range(problem.channels)]
+        channels = [_channel(problem, fits, b, rows, j, moving) for j in range(problem.channels)]
         ratios, occam = borne([_sizes(problem, one, j, known[j]) for j, one in enumerate(channels)])
         both = [one.marginal(ratio) for one, ratio in zip(channels, ratios, strict=True)]
         grams, logs = np.stack([gram for gram, _ in both]), np.array([log for _, log in both])
         number = np.array([one.number for one in channels])
         one = correlated(problem, fits, b, grams, logs, number, occam, priors)
-        out.append(_told(problem, one, fits.z[b], channels, ratios, grams))
+        told = _told(problem, one, fits.z[b], channels, ratios, grams)
+        out.append(replace(told, kind="kinematic" if moving else "positional"))
     return out
 
 
-def _channel(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int) -> _Channel:
+def _channel(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int, moving: bool) -> _Channel:
     weight = weights(problem, rows)
-    expected = np.concatenate([p.readings[b, :, j] for p in fits.predictions])
-    seen = np.concatenate([w[:, j] > 0 for w in weight])
-    ends, parts = _ends(expected, seen), []
-    shapes = polynomials(expected, *ends).T
+    expected, times = [p.readings[b, :, j] for p in fits.predictions], _times(problem, weight)
+    seen, parts = np.concatenate([w[:, j] > 0 for w in weight]), []
+    shapes = Shapes.over(expected, times, seen, moving)
     for r, (x, w) in enumerate(zip(residuals(problem, fits.predictions, weight), weight, strict=True)):
         slopes = np.zeros((problem.size, len(w)))
         slopes[problem.local(r)] = fits.predictions[r].slopes[b, :, :, j]
-        parts.append(np.concatenate([x[b, None, :, j], slopes]))
+        parts.append(np.concatenate([x[b, None, :, j], slopes, shapes(expected[r], times[r]).T]))
     root = np.sqrt(np.concatenate([w[:, j] for w in weight]))
-    columns = np.where(seen, np.concatenate([np.concatenate(parts, axis=1), shapes]), 0.0) * root
-    return _Channel(columns, 1 + problem.size, seen, float(2 * np.log(root[seen]).sum()), ends)
+    columns = np.where(seen, np.concatenate(parts, axis=1), 0.0) * root
+    return _Channel(columns, 1 + problem.size, seen, float(2 * np.log(root[seen]).sum()), shapes)
 
 
-def _ends(expected: Float[np.ndarray, " row"], seen: Bool[np.ndarray, " row"]) -> tuple[float, float]:
-    """The range of what is read."""
-    some = expected[seen] if seen.any() else np.zeros(1)
-    return float(some.min()), float(some.max())
+def _times(problem: Problem, weight: Sequence[np.ndarray]) -> list[Float[np.ndarray, " _"]]:
+    return [r.times[: len(w)] for r, w in zip(problem.rows, weight, strict=True)]
 
 
 def whitened_along(
     columns: Sequence[Float[np.ndarray, "column _"]], shown: Sequence[Float[np.ndarray, " _"]],
-    weight: Sequence[Float[np.ndarray, " _"]], ratio: float,
+    times: Sequence[Float[np.ndarray, " _"]], weight: Sequence[Float[np.ndarray, " _"]], ratio: float, moving: bool,
 ) -> list[Float[np.ndarray, "column _"]]:  # fmt: skip
     """One channel's columns, by recording, whitened beside an error that goes with what is read: the noise's variance
     and that of `ratio` times its size together. `shown` are the expected readings."""
     w, every = np.concatenate(weight), np.concatenate(columns, axis=1)
-    expected = np.concatenate(shown)
-    rest = np.where(w > 0, polynomials(expected, *_ends(expected, w > 0)).T, 0.0) * np.sqrt(w)
+    shapes = Shapes.over(shown, times, w > 0, moving)
+    whole = np.concatenate([shapes(x, t) for x, t in zip(shown, times, strict=True)])
+    rest = np.where(w > 0, whole.T, 0.0) * np.sqrt(w)
     _, sizes, ways = np.linalg.svd(rest, full_matrices=False)
     less = 1.0 - 1.0 / np.sqrt(1.0 + ratio / len(rest) * sizes**2)
     every = every * np.sqrt(w)
@@ -157,7 +162,7 @@ def _told(
     bent = np.where(told, 0.0, (total / one.noise**2 - 1.0) / averaged)
     inflation = variance_inflation(scores.T)
     bends = tuple(c.bend(column, *both) for c, *both in zip(channels, ratios, one.noise, strict=True))
-    return replace(one, kind="positional", bent=tuple(bent.tolist()), bends=() if told.any() else bends,
+    return replace(one, bent=tuple(bent.tolist()), bends=() if told.any() else bends,
                    log_evidence=value, inflation=inflation)  # fmt: skip
 
 

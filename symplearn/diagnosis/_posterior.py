@@ -19,7 +19,7 @@ CONSISTENT = 0.05
 # Prior share of a remainder beside findings: as many cases as issue 6 would have carry one.
 _BESIDE = 0.25
 # Kinds of remainder other than white noise, which divide its prior among them.
-_REMAINDERS = ("coloured", "clock", "positional", "jitter", "static", "force", "spell")
+_REMAINDERS = ("coloured", "clock", "positional", "kinematic", "jitter", "static", "force", "spell")
 
 
 @dataclass(frozen=True)

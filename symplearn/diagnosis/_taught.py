@@ -49,7 +49,7 @@ class Errors:
         z[problem.local(0)] = own
         found = stepper.predict(z[None], [e.combination], [length] + [1] * (len(problem.rows) - 1))[0]
         scale = np.where(np.isnan(rows.readings), 0.0, row_roots(problem, 0, length, colour_ratio(e)) / total_noise(e))
-        expected = bent(found.readings[0], e.bends)
+        expected = bent(found.readings[0], rows.times, e.bends)
         return cls(scale, (np.nan_to_num(rows.readings) - expected) * scale, -found.slopes[0] * scale)
 
     def among(self, some: Bool[np.ndarray, "time channel"]) -> tuple[np.ndarray, np.ndarray]:

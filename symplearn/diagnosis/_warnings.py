@@ -24,6 +24,7 @@ _REMAINDERS = {
     "clock": "an error of the clock",
     "jitter": "an error of single times",
     "positional": "an error of the sensor that goes with what it reads",
+    "kinematic": "an error of the sensor that goes with what it reads and how fast that changes",
     "static": "a small force that goes with place",
     "force": "a small missing force",
     "spell": "a missing force for a while",

@@ -32,11 +32,11 @@ class Estimate:
     """A combination fitted under one kind of remainder.
 
     `kind` is `white` (no remainder), `coloured` (an error of the sensor with a memory), `clock` (one of its clock
-    beside that), `positional` (one that goes with what is read), `jitter` (one of each row's time), `static` (a small
-    force that goes with a coordinate), `force` (a white missing force of `intensity`) or `spell` (one that acts for a
-    while: in the share `exposures` of each span, by recording).
-    `noise` is the white sd of one original reading, `bent` the variance of a positional error against its square,
-    `bends` that error itself.
+    beside that), `positional` (one that goes with what is read), `kinematic` (with how fast that changes, too),
+    `jitter` (one of each row's time), `static` (a small force that goes with a coordinate), `force` (a white missing
+    force of `intensity`) or `spell` (one that acts for a while: in the share `exposures` of each span, by recording).
+    `noise` is the white sd of one original reading, `bent` the variance of a positional or kinematic error against its
+    square, `bends` that error itself.
     """
 
     combination: Combination

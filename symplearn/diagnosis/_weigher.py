@@ -156,6 +156,7 @@ class Weigher:
             self._add(estimate, *self._outliers(fits, b))
         correlated = weigh_coloured(self.problem, fits, priors, self.rows)
         sensors = weigh_positional(self.problem, fits, priors, self.rows)
+        sensors += weigh_positional(self.problem, fits, priors, self.rows, moving=True)
         for estimate in correlated + sensors + weigh_jitter(self.problem, fits, priors, self.rows):
             self._add_beside_white(estimate)
 

@@ -19,7 +19,7 @@ Whiten = Callable[[Float[np.ndarray, "column reading"]], Float[np.ndarray, "colu
 def whitening(problem: Problem, fits: Fits, rows: Sequence[int], estimate: Estimate) -> Whiten | None:
     """What whitens the readings of a fit of one lane, and counts them by the noise that is left of the remainder that
     an estimate has; None for one without."""
-    if estimate.kind not in ("coloured", "clock", "positional"):
+    if estimate.kind not in ("coloured", "clock", "positional", "kinematic"):
         return None
     weight = weights(problem, rows)
     scale = fits.noise[0] / estimate.noise
@@ -48,4 +48,4 @@ def _channel(
         return [whitened_series(x, w, t, estimate.colours[j]).T for x, w, t in zip(columns, own, times, strict=True)]
     if estimate.kind == "clock":
         return whitened_beside(columns, shown, own, times, (estimate.colours[j], estimate.clocks[j]))
-    return whitened_along(columns, shown, own, estimate.bent[j])
+    return whitened_along(columns, shown, times, own, estimate.bent[j], estimate.kind == "kinematic")
