@@ -62,7 +62,7 @@ def test_what_follows_the_first_readings_best_is_tried_first(swings):
     """Of all draws the half that is tried first errs least in the closed form, in either recording; the rest is as it
     was drawn."""
     problem, priors = swings.problem, priors_without_effects(swings.problem)
-    drawn = begin._scattered(problem, priors)
+    drawn = begin.scattered(problem, priors)
     tried = begin._tried(swings, priors, [len(TIMES)] * 2)
     half = len(tried) // 2
     np.testing.assert_array_equal(tried[half:], drawn[:half])

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .._effects import COORDINATE, OUTLIERS, PAIR, Candidate
+from .._effects import COORDINATE, IMPULSE, OUTLIERS, PAIR, Candidate
 from .._expression import Expression
 from . import _document as document
 from ._along import energy
@@ -17,6 +17,7 @@ from ._effect_priors import STRENGTH
 from ._forecast import forecast
 from ._found import Found
 from ._locate import (
+    blows_sentence,
     kind_and_targets,
     motion,
     present_windows,
@@ -286,6 +287,9 @@ class Answer:
         moving = [one.place for one in chosen if one.effect.acts_on in (COORDINATE, PAIR)]
         if not moving and all(not one.effect.is_dynamics for one in chosen):
             return f"in the sensor of {', '.join(dict.fromkeys(one.targets[0] for one in chosen))}"
+        if all(one.effect is IMPULSE for one in chosen):
+            times = [self.values[member]["t_star"] for member in self.after.combination]
+            return blows_sentence(chosen, times)
         first = moving[0] if moving else strained_coordinates(self.lens)[0]
         return where_sentence(self.problem, self.lens[0], first)
 

@@ -336,7 +336,7 @@ def _steps(
             continue
         scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
         values, vectors = np.linalg.eigh(square / np.outer(scale, scale))
-        values = np.maximum(values, _FLAT * values[-1])
+        values = np.maximum(values, _FLAT * values.max(initial=0.0))  # none where everything is known
         along = vectors.T @ (vector[b, a] / scale)
         inverse[b][np.ix_(a, a)] = (vectors / (values + damping[b])) @ vectors.T / np.outer(scale, scale)
         steps[b, a] = vectors @ (along / (values + damping[b])) / scale

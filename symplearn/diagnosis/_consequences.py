@@ -160,6 +160,8 @@ def _offsets(said: Said) -> str:
 
 
 def _scales(said: Said) -> str:
+    if said.mean("g") < -1.0:
+        return f"It shows everything with the opposite sign, {number(-1.0 - said.mean('g'))} times as large; {_ALONE}"
     way = said.by_sign("g", "large", "small")
     return f"It shows everything {said.percent('g')} too {way}; {_ALONE}"
 

@@ -21,6 +21,7 @@ from ._search import Search
 from ._start import first_fits, priors_without_effects
 from ._trajectory import Stepper
 from ._unnamed import proposals
+from ._usable import check_fitted, check_motion, check_searched, check_steps
 from ._weighed import Estimate
 
 # Third differences show the noise and some of the motion: the share of them that counts as noise at least.
@@ -32,7 +33,11 @@ _CLEAR = 5.0
 def searched(
     file: SimulationFile, recordings: Sequence[Recording], options: Options, deadline: float
 ) -> tuple[Found, Stepper]:
-    """Lay the problem out with substeps that are fine enough, and search; once more where what is found needs finer."""
+    """Lay the problem out with substeps that are fine enough, and search; once more where what is found needs finer.
+
+    `InputError` where there is nothing to fit, to search or to step.
+    """
+    check_steps(file, recordings)
     first, middle = float(recordings[0].times[0]), float(np.mean(recordings[0].times[[0, -1]]))
     built = augmented_equations(file, first, options.restriction, middle)
     substep = first_substep(file, recordings)
@@ -41,6 +46,9 @@ def searched(
         return build(file, built, recordings, options.holdout, longest, options.restriction)
 
     problem = rebuild(substep)
+    check_fitted(file, problem, options.holdout)
+    check_searched(problem, options.restriction)
+    check_motion(file, problem)
     stepper = Stepper(problem, options.jobs)
     options.progress("finding where the motion starts")
     seeds = first_fits(stepper, priors_without_effects(problem), rows_fitted(problem.rows))

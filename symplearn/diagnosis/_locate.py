@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._effects import IMPULSE, Candidate
+from ._law_text import number
 from ._outlook import Outlook
 from ._problem import Combination, Problem
 
@@ -155,3 +156,9 @@ def where_sentence(problem: Problem, outlook: Outlook, coordinate: int) -> str:
         f"the missing force on {name} goes with {goes}: of what the two explain of it, "
         f"{speed} goes with speed and {place} with position"
     )
+
+
+def blows_sentence(blows: Sequence[Candidate], times: Sequence[float]) -> str:
+    """What is struck, and when: a blow goes with neither speed nor place."""
+    struck = [f"a blow to {one.targets[0]} at t = {number(t)}" for one, t in zip(blows, times, strict=True)]
+    return " and ".join(struck)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from .._effects import HIDDEN, Oscillating
+from .._effects import GAIN, HIDDEN, Oscillating
+from ._constant import constant_evidence
 from ._found import Ahead, Found, speaker
 from ._problem import Combination, Problem
 from ._strength import faint_share
@@ -14,10 +15,14 @@ from ._weighed import Estimate
 
 # A coefficient whose posterior is as wide as this share of its prior has learnt nothing from the recording.
 _UNINFORMED = 0.7
+# A sensor that shows less than this share of the motion shows none of it, and its scale is no finding.
+_DEAD = 0.1
 # The simulation counts as consistent unless the probability of nothing left out is below this (contract).
 CONSISTENT = 0.05
 # Prior share of a remainder beside findings: as many cases as issue 6 would have carry one.
 _BESIDE = 0.25
+# Constants tell readings as well that are behind by so many nats at most.
+_AS_WELL = 3.0
 # Kinds of remainder other than white noise, which divide its prior among them.
 _REMAINDERS = ("coloured", "clock", "positional", "kinematic", "jitter", "static", "force", "spell")
 
@@ -49,6 +54,7 @@ class Posterior:
     nothing: Estimate  # the best estimate without effects
     evidences: dict[Combination, float]  # tempered log evidence of everything fitted, nothing (best kind) included
     tempered: float
+    is_constant: bool  # whether readings are told as well by constants as by anything that was weighed
 
 
 def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
@@ -57,11 +63,12 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     factor = 1.0 / max(1.0, inflation)
     top = max(e.log_evidence for es in found.estimates.values() for e in es)
     if not np.isfinite(top):
-        return Posterior(0.0, 1.0, (), 0.0, speaker(found.estimates[()]), {(): -np.inf}, factor)
+        return Posterior(0.0, 1.0, (), 0.0, speaker(found.estimates[()]), {(): -np.inf}, factor, False)
     unseen = min((one.score for one in found.ahead.values()), default=0.0)
     bare = found.of((), "white")
     least = -np.inf if bare is None else top + factor * (bare.log_evidence - top)
-    white, other, named = -np.inf, -np.inf, []
+    constant = top + factor * (constant_evidence(problem) - top)
+    white, other, named = -np.inf, constant + np.log(remainder), []
     evidences: dict[Combination, float] = {}
     for combination, estimates in found.estimates.items():
         tempered = {e.kind: top + factor * (e.log_evidence - top) for e in estimates}
@@ -95,6 +102,7 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
         nothing=speaker(found.estimates[()]),
         evidences=evidences,
         tempered=factor,
+        is_constant=bool(constant > max(evidences[c] for c in ((), *(c for c, *_ in named))) - _AS_WELL),
     )
 
 
@@ -153,6 +161,7 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
     An effect that calibration owns already (a stiffness beside a free stiffness) changes nothing, and its
     posterior is its prior; weighing it would only dilute the others. One that would swing, but fits best where it has
     not come round once, at the lowest frequency looked for or below, was not seen to swing: any slow change would do.
+    A scale that makes a reading vanish says nothing of the motion that was to be read.
     """
     best = max(found.estimates[combination], key=lambda e: e.log_evidence)
     sd = np.sqrt(np.diag(best.covariance))
@@ -165,7 +174,7 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
         if one.effect is HIDDEN:  # how it swings may be seen where how strongly it is joined is not
             starts = np.stack([problem.unseen(r) for r in problem.members[member].recordings])
             shown |= bool((sd[starts] < _UNINFORMED * found.priors.unseen).any())
-        known &= shown
+        known &= shown and not (one.effect is GAIN and abs(1.0 + best.z[place.start]) < _DEAD)
         if one.effect is HIDDEN or isinstance(one.effect, Oscillating):
             known &= bool(best.z[place.stop - 1] > found.priors.lower[one.values.stop - 1])
     return bool(np.isfinite(best.log_evidence) and known)

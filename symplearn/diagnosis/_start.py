@@ -89,7 +89,7 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
 
 def _tried(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Float[np.ndarray, "lane z"]:
     """Where the first fits begin: half as drawn, half those of many draws that follow a few rows best as they are."""
-    drawn = _scattered(stepper.problem, priors)
+    drawn = scattered(stepper.problem, priors)
     predictions = stepper.predict(drawn, [()] * _DRAWN, rows)
     half = _TRIED // 2
     side_by_side = [(k,) * len(rows) for k in range(half)]
@@ -98,7 +98,7 @@ def _tried(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Float[np.nd
     return np.concatenate([best, drawn[:half]])
 
 
-def _scattered(problem: Problem, priors: Priors) -> Float[np.ndarray, "lane z"]:
+def scattered(problem: Problem, priors: Priors) -> Float[np.ndarray, "lane z"]:
     """Prior means with initial states drawn from their priors, or about them where nothing is known."""
     rng = np.random.default_rng(0)
     z = np.tile(priors.mean, (_DRAWN, 1))

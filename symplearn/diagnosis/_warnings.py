@@ -1,5 +1,6 @@
 """What a reader of a diagnosis must be told."""
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -53,6 +54,9 @@ def warnings(
         given, used = sum(r.given for r in problem.rows), sum(r.used for r in problem.rows)
         out.append(f"the rows were averaged from {given} to {used}: "
                    "they are sampled far above the motion's frequencies")  # fmt: skip
+    if odds.is_constant:
+        out.append("nothing that was read shows the simulated motion: constants and noise tell the readings as well; "
+                   "check [initial], the units, and [recording.observe]")  # fmt: skip
     if not after.converged:
         out.append("the fit did not converge; its numbers are not to be relied on")
     if not all(np.isfinite(o.readings).all() for o in (*without, *with_)):
@@ -66,6 +70,7 @@ def warnings(
     if not found.is_fine:
         out.append("halving the substeps once more still changes the readings by what can be seen: the motion is too "
                    "stiff, or too sensitive, for them; try a shorter [integrator] step")  # fmt: skip
+    out += [f"recordings {a} and {b} hold the same numbers: what they show counts twice" for a, b in _same(recordings)]
     if not found.complete:
         out.append("the time limit was reached before every combination was weighed")
     for j, name in enumerate(c.names):
@@ -85,6 +90,15 @@ def warnings(
         out.append(f"evidence was discounted by a factor of {1 / odds.tempered:.1f}: "
                    "the remainder is not white on the scale of the motion")  # fmt: skip
     return out
+
+
+def _same(recordings: Sequence[Recording]) -> list[tuple[int, int]]:
+    """Numbers of recordings that are copies of one another."""
+    return [
+        (a.number, b.number)
+        for a, b in itertools.combinations(recordings, 2)
+        if np.array_equal(a.times, b.times) and np.array_equal(a.readings, b.readings, equal_nan=True)
+    ]
 
 
 def _when(problem: Problem, recordings: Sequence[Recording], best: Estimate) -> str:

@@ -1,0 +1,69 @@
+"""What a diagnosis cannot begin with, each told in one sentence."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .._errors import InputError
+from .._recording import Recording
+from .._simulation_records import SimulationFile
+from ._along import along, force, readings, velocity
+from ._build import Restriction
+from ._problem import Problem
+from ._start import priors_without_effects, scattered
+
+# Substeps that can be laid out in all, some hundred megabytes of times.
+_STEPS = 2e7
+# Starts at which the equations of motion are looked at, a few at a time.
+_TRIED, _AT_ONCE = 24, 3
+_SAID = {
+    "velocities that follow from the Hamiltonian": velocity,
+    "forces that follow from the Hamiltonian": force,
+    "readings": readings,
+}
+
+
+def check_steps(file: SimulationFile, recordings: Sequence[Recording]) -> None:
+    """The file's own step is no finer than can be laid out. `InputError` otherwise."""
+    step = file.integrator.step
+    if step is None:
+        return
+    span = sum(float(r.times[-1] - r.times[0]) for r in recordings)
+    if span / step > _STEPS:
+        raise InputError(
+            f"{file.name}, [integrator] step: {step:g} makes {span / step:,.0f} steps of the recordings' {span:g}, "
+            f"more than can be taken; give at least {span / _STEPS:.1g}"
+        )
+
+
+def check_fitted(file: SimulationFile, problem: Problem, holdout: float) -> None:
+    """Enough rows are left for fitting. `InputError` otherwise."""
+    rows = sum(int((r.counts[: r.fitted] > 0).any(1).sum()) for r in problem.rows)
+    unknown = file.unknowns + file.unknown_states * len(problem.rows)
+    if rows < max(unknown, 1):
+        raise InputError(
+            f"--holdout: {holdout:g} leaves {rows} rows with readings for fitting, but {file.name} leaves {unknown} "
+            "numbers unknown; hold out less, or give more rows"
+        )
+
+
+def check_searched(problem: Problem, restriction: Restriction) -> None:
+    """Some effect that was asked for can be in the simulation. `InputError` otherwise."""
+    if restriction.effects is not None and not problem.searched:
+        raise InputError(
+            f"--effects: the simulation has nothing that {', '.join(restriction.effects)} could act on; "
+            "name others, or leave the option out"
+        )
+
+
+def check_motion(file: SimulationFile, problem: Problem) -> None:
+    """What moves the simulation and what is read of it are numbers at some start. `InputError` otherwise."""
+    priors = priors_without_effects(problem)
+    starts = scattered(problem, priors)[:_TRIED, : problem.state]
+    for said, what in _SAID.items():
+        tried = (along(problem, what, 0, priors.mean, (), starts[k : k + _AT_ONCE]) for k in range(0, _TRIED, _AT_ONCE))
+        if not any(np.isfinite(found).all(1).any() for found in tried):
+            raise InputError(
+                f"{file.name}: the {said} are no numbers wherever the motion starts; look for a division by zero or "
+                "a root of what is negative, and correct the expression or the parameters"
+            )

@@ -1,0 +1,85 @@
+"""Where nothing can be fitted, searched, stepped or read, that is said in one sentence before any work."""
+
+import engine_cases as cases
+import numpy as np
+import pytest
+
+from symplearn import InputError
+from symplearn._recording import Recording
+from symplearn._recording_checks import check_recordings
+from symplearn.diagnosis import Options, Restriction, diagnose
+
+TIMES = np.linspace(0.0, 20.0, 60)
+
+
+AS_USUAL = Options()
+
+
+def refusal(file, recording, options=AS_USUAL):
+    """The sentence of the refusal."""
+    with pytest.raises(InputError) as said:
+        diagnose(file, [recording], options)
+    assert "\n" not in str(said.value)
+    return str(said.value)
+
+
+def swing(**more):
+    return cases.simulation("p**2/(2*m) + q**2/2", more="[parameters]\nm = 1.0", **more)
+
+
+def read():
+    return cases.recorded(TIMES, np.cos(TIMES))
+
+
+def test_a_holdout_that_leaves_next_to_nothing_is_refused():
+    """Of 60 rows a hold-out of 0.99 leaves two, too few for a start and a mass: how many rows are left and how many
+    numbers are unknown is said."""
+    file = cases.simulation("p**2/(2*m) + q**2/2", more="[parameters]\nm = { value = 1.0, sd = 0.1 }")
+    assert "0.99 leaves 2 rows" in (said := refusal(file, read(), Options(holdout=0.99)))
+    assert "3 numbers unknown" in said
+
+
+@pytest.mark.parametrize(
+    ("energy", "more", "what"),
+    [
+        ("p**2/(2*m) + q**2/2", "m = 0.0", "velocities"),
+        ("p**2/2 + m*q**2/2 + sqrt(-1 - q**2)", "m = 1.0", "forces"),
+    ],
+)
+def test_equations_that_give_no_number_anywhere_are_refused(energy, more, what):
+    """A division by a mass of zero and a root of what is negative everywhere."""
+    file = cases.simulation(energy, more=f"[parameters]\n{more}")
+    assert f"the {what} that follow from the Hamiltonian are no numbers" in refusal(file, read())
+
+
+def test_a_pole_is_no_reason():
+    """A force that is singular at one place alone is stepped: a repulsion that grows without bound at zero."""
+    y = cases.solved(lambda t, x: [x[1], x[0] ** -3 - x[0]], [1.5, 0.0], TIMES)[:, 0]
+    y = y + 0.01 * np.random.default_rng(1).normal(size=len(y))
+    file = cases.simulation("p**2/2 + q**2/2 + 1/(2*q**2)")
+    document = diagnose(
+        file, [cases.recorded(TIMES, y)], Options(restriction=Restriction(("viscous_damping",)))
+    ).document
+    assert document["verdict"] == "consistent"
+
+
+def test_a_step_too_fine_to_be_taken_is_refused():
+    """Twenty units of time in steps of 1e-9; the finest that is possible is said."""
+    file = cases.simulation("p**2/2 + q**2/2", more='[integrator]\nname = "auto"\nstep = 1e-9')
+    assert "20,000,000,000 steps" in (said := refusal(file, read()))
+    assert "give at least 1e-06" in said
+
+
+def test_effects_that_can_be_nowhere_are_refused():
+    """Of one coordinate none can be coupled to another."""
+    said = refusal(swing(), read(), Options(restriction=Restriction(("gyroscopic_coupling",))))
+    assert "gyroscopic_coupling" in said
+
+
+@pytest.mark.parametrize("reading", [1e300, -1e101])
+def test_a_reading_too_large_to_compute_with_is_refused(reading):
+    """Its square is no number; column and reading are told. A recording without readings beside it is none of that."""
+    one = Recording(1, "a.csv", ("y",), TIMES, np.where(np.arange(60) == 7, reading, np.cos(TIMES))[:, None], TIMES)
+    none = Recording(2, "b.csv", ("y",), TIMES, np.full((60, 1), np.nan), TIMES)
+    with pytest.raises(InputError, match=r"a\.csv: a reading of `y` is -?1e\+[13]0[01], too large"):
+        check_recordings(swing(), [none, one])
