@@ -65,6 +65,7 @@ class Outlook:
     recording: int
     intensity: Float[np.ndarray, " d"]
     exposures: tuple[np.ndarray, ...] | None = None  # where the missing force does not always act
+    near: "Outlook | None" = None  # one that begins close by, within the same reach
 
     @property
     def rows(self) -> Any:
@@ -92,6 +93,8 @@ class Outlook:
     @cached_property
     def _start_spread(self) -> Float[np.ndarray, "state state"]:
         """Posterior covariance of the phase point at the first row, as far as the Gaussian holds."""
+        if self.near is not None:
+            return self.near._start_spread
         state = self.stepper.problem.state
         return covariance_within_reach(self.stepper, self.estimate, self.recording)[:state, :state]
 
@@ -179,7 +182,7 @@ class Outlook:
         in turn, those before it being known and the start following. What diverges then says nothing."""
         variance = np.zeros_like(self.run)
         for z in one_off(self.stepper.problem, self.estimate, self.recording, inflation):
-            other = replace(self, estimate=replace(self.estimate, z=z))
+            other = replace(self, estimate=replace(self.estimate, z=z), near=self)
             variance += np.nan_to_num((other.run - self.run) ** 2, posinf=0.0)
         return variance[1:]
 

@@ -5,6 +5,8 @@ is as wide there as the prior, along a tangent: a standard deviation off, the or
 out is filtered to nowhere, and what is drawn there says nothing.
 """
 
+from functools import partial
+
 import numpy as np
 from jaxtyping import Float
 
@@ -55,8 +57,8 @@ def _share(
 ) -> float:
     """The largest share of a direction, halved again and again, in which readings are even about those of the fit."""
     for share in 0.5 ** np.arange(_HALVINGS):
-        both = [_readings(stepper, e, recording, sign * share * along) for sign in (-1.0, 1.0)]
-        if float((((both[0] + both[1]) / 2 - middle) ** 2).sum()) <= _BENT:
+        both = stepper.ahead(partial(_readings, stepper, e, recording), [-share * along, share * along])
+        if float(((sum(both) / 2 - middle) ** 2).sum()) <= _BENT:
             break
     return float(share)
 
