@@ -1,4 +1,4 @@
-"""Square roots of covariances: triangular factors that exist for singular covariances too, without LAPACK.
+"""Square roots of covariances: triangular factors that exist for singular covariances too, without LAPACK's.
 
 Small matrices a column at a time. For them a call of LAPACK costs more than the arithmetic, its QR has no derivative
 where the rank is deficient, as with a state that is known exactly, and batches of a hundred thousand of its solves were
@@ -22,6 +22,10 @@ _INDEFINITE = 1e-6
 _FLAT = 16
 # Up to so many rows an orthogonalisation is laid out flat, too; with 16 its gradient took twice as long as in a loop.
 _FEW_ROWS = 12
+# Beyond so many rows whole panels of them are freed of each other by products, 804 rows 13 times as fast as row by row.
+_MANY_ROWS, _PANEL = 128, 32
+# Beyond so many a triangle no longer fits the fast memory, and LAPACK's inverse of 804 rows took a sixth of the loop's.
+_LARGE = 512
 
 
 def triangularise(rows: Float[Array, "size column"]) -> tuple[Float[Array, "size size"], Bool[Array, " size"]]:
@@ -37,7 +41,10 @@ def triangularise(rows: Float[Array, "size column"]) -> tuple[Float[Array, "size
 @jax.custom_jvp
 def _orthogonalised(rows: Array) -> tuple[Array, Array, Array]:
     """L, the orthonormal Q (size, column) with rows = L Q, zero where a pivot is, and which pivots are not."""
-    return _row_by_row(rows) if rows.shape[0] <= _FEW_ROWS else _column_by_column(rows)
+    size = rows.shape[0]
+    if size > _MANY_ROWS:
+        return _panel_by_panel(rows)
+    return _row_by_row(rows) if size <= _FEW_ROWS else _column_by_column(rows, jnp.sum(rows**2, axis=1))
 
 
 @_orthogonalised.defjvp
@@ -78,8 +85,8 @@ def _row_by_row(rows):
     return jnp.stack(triangle), jnp.stack(directions), jnp.stack(good)
 
 
-def _column_by_column(rows):
-    """For many rows: each frees all later ones of itself."""
+def _column_by_column(rows, scales):
+    """For more rows: each frees all later ones of itself. `scales` are the squared lengths that they began with."""
     size = rows.shape[0]
 
     def column(rest, data):
@@ -93,14 +100,42 @@ def _column_by_column(rows):
         entries = jnp.where(here & good, length, entries)
         return rest - jnp.outer(entries, direction), (entries, direction, good)
 
-    data = np.arange(size), np.eye(size, dtype=bool), np.tri(size, k=-1, dtype=bool).T, jnp.sum(rows**2, axis=1)
+    data = np.arange(size), np.eye(size, dtype=bool), np.tri(size, k=-1, dtype=bool).T, scales
     _, (columns, directions, good) = jax.lax.scan(column, rows, data)
     return columns.T, directions, good
+
+
+def _panel_by_panel(rows):
+    """For very many: each panel, orthogonalised by itself, frees all later rows of itself at once.
+
+    Block Gram-Schmidt with the modified one inside (Barlow 2019), as accurate for L as that by single rows.
+    """
+    size, columns = rows.shape
+    number = -(-size // _PANEL)
+    # Rows of zeros make the last panel whole: their pivots are zero.
+    rows = jnp.concatenate([rows, jnp.zeros((number * _PANEL - size, columns), rows.dtype)])
+    scales = jnp.sum(rows**2, axis=1)
+
+    def panel(rest, first):
+        own = jax.lax.dynamic_slice_in_dim(rest, first, _PANEL)
+        inner, directions, good = _column_by_column(own, jax.lax.dynamic_slice_in_dim(scales, first, _PANEL))
+        later = (np.arange(len(rest)) >= first + _PANEL)[:, None]
+        entries = jnp.where(later, product(rest, directions.T), 0.0)
+        triangle = jax.lax.dynamic_update_slice_in_dim(entries, inner, first, 0)
+        return rest - product(entries, directions), (triangle, directions, good)
+
+    _, (triangles, directions, good) = jax.lax.scan(panel, rows, _PANEL * np.arange(number))
+    triangle = jnp.swapaxes(triangles, 0, 1).reshape(len(rows), -1)
+    return triangle[:size, :size], directions.reshape(-1, columns)[:size], good.reshape(-1)[:size]
 
 
 def _inverse(L, good):
     """L^-1, with zeros in the rows of zero pivots, whose columns are zero in L."""
     size = L.shape[0]
+    if size > _LARGE:
+        unit = np.eye(size, dtype=L.dtype)
+        whole = jnp.where((unit > 0) & ~good, 1.0, L)
+        return jnp.where(good[:, None], jax.scipy.linalg.solve_triangular(whole, unit, lower=True), 0.0)
     if size > _FEW_ROWS:
         return _inverse_in_a_loop(L, good)
     rows: list[Array] = []

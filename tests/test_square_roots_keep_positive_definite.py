@@ -61,7 +61,7 @@ def test_ten_thousand_precise_readings_never_lose_it():
     assert np.array_equal(covariances, np.swapaxes(covariances, 1, 2))
 
 
-@pytest.mark.parametrize("shape", [(1, 3), (4, 4), (5, 12), (20, 45)])
+@pytest.mark.parametrize("shape", [(1, 3), (4, 4), (5, 12), (20, 45), (140, 300)])
 def test_triangularise_is_qr(shape):
     """L is lower triangular with positive diagonal and L L' = M M', as NumPy's QR of M' has it."""
     M = np.random.default_rng(0).normal(size=shape) * np.logspace(0, -6, shape[0])[:, None]
@@ -113,6 +113,28 @@ def test_dependent_rows_get_a_zero_column():
     # The repeated row's entry is its product with the unit row along the first one.
     expected = jax.jacrev(lambda M: M[1] @ M[0] / jnp.linalg.norm(M[0]))(M)
     np.testing.assert_allclose(slope[1, 0], expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("size", [140, 550])
+def test_many_rows_go_by_panels(size):
+    """Of more rows than go one by one, one repeated, one of zeros and one a sum of two in other panels: L L' is M M',
+    their pivots alone are zero; a slope is that of the Cholesky factor of the other rows."""
+    rng = np.random.default_rng(size)
+    M, way = rng.normal(size=(2, size, size + 9))
+    M[50], M[70], M[size - 3] = 2.0 * M[3], 0.0, M[1] + M[40]
+    (L, good), (slope, _) = jax.jvp(jax.jit(triangularise), (jnp.asarray(M),), (jnp.asarray(way),))
+    assert np.flatnonzero(~np.asarray(good)).tolist() == [50, 70, size - 3] and np.array_equal(L, np.tril(L))
+    # Sums of some hundred products of size one: round-off of 1e-13.
+    np.testing.assert_allclose(L @ L.T, M @ M.T, atol=1e-11)
+    kept = jnp.asarray(np.flatnonzero(good))
+    assert not np.any(np.asarray(L)[:, ~np.asarray(good)])
+
+    def root(M):
+        return jnp.linalg.cholesky(M[kept] @ M[kept].T)
+
+    expected = jax.jvp(root, (jnp.asarray(M),), (jnp.asarray(way),))[1]
+    # Rows that are left out turn directions of none; a matrix of condition some thousands costs four digits.
+    np.testing.assert_allclose(slope[np.ix_(kept, kept)], expected, atol=1e-9)
 
 
 def test_forward_substitution_solves():
