@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
@@ -76,9 +77,14 @@ def integrate(
         raise ValueError(f"`x0` must be one phase point [q, p] of even length, but has shape {x0.shape}.")
     if ts.ndim != 1 or ts.shape[0] == 0:
         raise ValueError(f"`ts` must be a row of one or more times, but has shape {ts.shape}.")
-    if isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1:
-        raise ValueError(f"`substeps` must be a whole number from 1 up, but is {substeps!r}.")
+    _refuse_count(substeps)
     return _integrate(strongly_typed(system), strongly_typed(integrator), x0, ts, substeps)
+
+
+def _refuse_count(substeps: Any) -> None:
+    is_count = isinstance(substeps, int | np.integer) and not isinstance(substeps, bool)
+    if not is_count or substeps < 1:
+        raise ValueError(f"`substeps` must be a whole number from 1 up, but is {substeps!r}.")
 
 
 def propagate(
@@ -93,6 +99,8 @@ def propagate(
 
     The propagator of a filter, not jitted. It lifts at each call, so over many calls a method of two copies,
     such as `Tao`, is no longer symplectic.
+
+    **Raises:** `ValueError` as `advance`.
     """
     return integrator.project(advance(system, integrator, integrator.lift(x), t0, t1, substeps))
 
@@ -105,7 +113,11 @@ def advance(
     t1: Time,
     substeps: int = 1,
 ) -> Float[Array, "n ..."]:
-    """The integrator's own state after `substeps` equal steps from `t0` to `t1`. Not jitted."""
+    """The integrator's own state after `substeps` equal steps from `t0` to `t1`. Not jitted.
+
+    **Raises:** `ValueError` where `substeps` is no whole number from 1 up.
+    """
+    _refuse_count(substeps)
     return integrator.march(system.prepared(), state, t0, (t1 - t0) / substeps, substeps)
 
 

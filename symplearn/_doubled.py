@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 import integrators as ig
 
+from ._counts import refuse_count
 from ._errors import InputError
 from ._model import AbstractAffine, Gaussian, Interval, Propagator, StateSpaceModel
 from ._noise import AbstractNoise, Multiplicative, enter
@@ -38,8 +39,7 @@ class DoubledPropagator(eqx.Module):
     substeps: int = eqx.field(static=True, default=1)
 
     def __check_init__(self):
-        if self.substeps < 1:
-            raise InputError(f"`DoubledPropagator` needs at least one substep, but was given {self.substeps}.")
+        refuse_count("DoubledPropagator", "substeps", self.substeps)
         _require_two_copies(self.integrator)
         self.integrator.accepts(self.system)
 

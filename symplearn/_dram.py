@@ -42,7 +42,8 @@ class DRAM(AbstractBlockSampler):
     scout: AdaptiveImportance = SCOUT
 
     def __check_init__(self):
-        refuse_counts(self, chains=2, thin=1, steps=4 * self.thin, patience=1)
+        refuse_counts(self, chains=2, thin=1, patience=1)
+        refuse_counts(self, steps=4 * self.thin)
         if not 0 < self.shrinkage < 1:
             raise InputError(f"`DRAM` needs `shrinkage` between 0 and 1, but was given {self.shrinkage}.")
 

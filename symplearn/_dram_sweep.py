@@ -16,6 +16,7 @@ import numpy as np
 from blackjax.base import SamplingAlgorithm
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
+from ._counts import refuse_count
 from ._errors import InputError
 from ._sampler import possible
 
@@ -88,8 +89,7 @@ class Sweep(eqx.Module):
     shrinkage: float = eqx.field(static=True)
 
     def __check_init__(self):
-        if self.patience < 1:
-            raise InputError(f"DRAM needs a `patience` of 1 sweep or more, but was given {self.patience}.")
+        refuse_count("DRAM", "patience", self.patience)
         if not 0 < self.shrinkage < 1:
             raise InputError(f"DRAM needs `shrinkage` between 0 and 1, but was given {self.shrinkage}.")
 

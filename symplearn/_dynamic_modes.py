@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ._counts import is_count
 from ._errors import InputError
 from ._inputs import EVENNESS
 from ._model import LinearDynamics
@@ -121,5 +122,5 @@ def _least_squares(before: np.ndarray, after: np.ndarray, rank: int | None) -> F
 
 
 def _require_positive(rank: int) -> None:
-    if rank < 1:
+    if not is_count(rank):
         raise InputError(f"`rank` counts singular directions and is at least 1, but is {rank}.")

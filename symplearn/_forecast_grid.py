@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ._counts import refuse_count
 from ._errors import InputError
 from ._model import AbstractAffine, Propagator
 from ._noise import WienerIncrement
@@ -87,8 +88,11 @@ def _held(grid: Grid, series: TimeSeries, inputs: Any) -> Any:
 def substeps_of(model: Any, grid: Grid, substeps: int | None) -> int | None:
     """Integrator steps per interval of the grid; None where the dynamics are no `Propagator`.
 
-    **Raises:** `InputError` where the dynamics are one step per data interval and the grid has others.
+    **Raises:** `InputError` where `substeps` is no whole number of at least 1, or the dynamics are one step per data
+    interval and the grid has others.
     """
+    if substeps is not None:
+        refuse_count("posterior_forecast", "substeps", substeps)
     lengths = np.diff(grid.times)
     dynamics = getattr(model, "dynamics", None)
     if isinstance(dynamics, Propagator):

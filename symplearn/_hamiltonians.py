@@ -12,6 +12,9 @@ from jaxtyping import Array, Float
 
 import integrators as ig
 
+from ._counts import refuse_count
+from ._errors import InputError
+from ._model_checks import shape_of
 from ._small_products import product
 
 # Terms of a gradient up to which they are written out one by one. Cherry's 60 would be no faster for it, and take six
@@ -245,7 +248,18 @@ def _coefficients(given: Any, terms: int) -> Any:
     """Zeros where none are given: a random start of a cubic potential lets trajectories escape."""
     if given is None:
         return jnp.zeros(terms)
-    return given if isinstance(given, eqx.Module) else jnp.asarray(given, dtype=float)
+    given = given if isinstance(given, eqx.Module) else jnp.asarray(given, dtype=float)
+    if (shape := shape_of(given)) is not None and shape[-1:] != (terms,):
+        raise InputError(
+            f"A polynomial with {terms} terms needs as many coefficients, but was given the shape {shape}; `terms` "
+            "tells their order."
+        )
+    return given
+
+
+def _refuse_counts(polynomial: Any) -> None:
+    for name in ("dim", "degree"):
+        refuse_count(type(polynomial).__name__, name, getattr(polynomial, name))
 
 
 class PolynomialPotential(ig.AbstractSeparableHamiltonian):
@@ -253,6 +267,9 @@ class PolynomialPotential(ig.AbstractSeparableHamiltonian):
 
     **Arguments:** `dim` - degrees of freedom; `degree`; `coefficients` - (term,) in the order of `terms`,
     zeros if left out; `basis` - `Monomials()` or `Legendre(box)`. It prints as an equation.
+
+    **Raises:** `InputError` where `dim` or `degree` is no whole number of at least 1, or there are not as many
+    coefficients as terms.
     """
 
     dim: int = eqx.field(static=True)
@@ -262,6 +279,7 @@ class PolynomialPotential(ig.AbstractSeparableHamiltonian):
 
     def __init__(self, dim: int, degree: int, coefficients: Any = None, basis: AbstractBasis = MONOMIALS):
         self.dim, self.degree, self.basis = dim, degree, basis
+        _refuse_counts(self)
         self.coefficients = _coefficients(coefficients, len(exponents(dim, degree)))
 
     @property
@@ -293,6 +311,8 @@ class Polynomial(ig.AbstractHamiltonian):
     """H(q, p) of all products of total degree 1..`degree` in the variables [q, p]. Dissertation sec. 5.4.2.
 
     Arguments as for `PolynomialPotential`. With dim 2 and degree 3 there are 34 terms.
+
+    **Raises:** `InputError` as `PolynomialPotential`.
     """
 
     dim: int = eqx.field(static=True)
@@ -302,6 +322,7 @@ class Polynomial(ig.AbstractHamiltonian):
 
     def __init__(self, dim: int, degree: int, coefficients: Any = None, basis: AbstractBasis = MONOMIALS):
         self.dim, self.degree, self.basis = dim, degree, basis
+        _refuse_counts(self)
         self.coefficients = _coefficients(coefficients, len(exponents(2 * dim, degree)))
 
     @property

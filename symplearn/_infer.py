@@ -11,6 +11,7 @@ from jaxtyping import PRNGKeyArray
 
 from ._errors import InputError
 from ._importance import AdaptiveImportance
+from ._keys import refuse_key
 from ._learn import learn
 from ._model import AbstractStateSpaceModel
 from ._nuts import NUTS
@@ -19,7 +20,7 @@ from ._posterior import Posterior
 from ._prior import AbstractDensity, Prior
 from ._random_walk import RandomWalk
 from ._sample import sample
-from ._sampler import AbstractSampler
+from ._sampler import AbstractSampler, refuse_sampler
 
 # The cheapest first, by effective draws a second on the posterior of Henon-Heiles (specification 5.15); each of the
 # later ones stands where the one before gives up.
@@ -50,6 +51,9 @@ def infer(
     """
     if not samplers:
         raise InputError("`infer` was given no samplers; leave `samplers` out, or give at least one.")
+    for sampler in samplers:
+        refuse_sampler(sampler)
+    refuse_key(key)
     start_key, draw_key = jax.random.split(key)
     estimate = learn(model, recordings, objective, prior=prior, key=start_key)
     tried: list[Posterior] = []

@@ -22,6 +22,7 @@ from ._descent import Place, coordinates, stacked, start
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
 from ._fit import Attempt, Estimate
+from ._keys import refuse_key
 from ._laplace_kinks import EVALUATIONS, ROUNDING, Task, end_at_kinks, kinks_of
 from ._learnable import refuse_unlearnable
 from ._model import AbstractStateSpaceModel, StateSpaceModel
@@ -68,6 +69,8 @@ def learn(
     several = as_recordings(recordings)
     series = several if isinstance(recordings, list | tuple) else several[0]
     refuse_unlearnable(model, several, "learn")
+    if key is not None:
+        refuse_key(key)
     starts = _portfolio(model, several, key)
     places, moves = _run(starts, Task(series, objective, prior, kinks_of(model, prior), tolerance))
     return _best(starts, places, moves, series, objective, prior, tolerance)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._counts import is_count
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
 from ._guard import guard
@@ -221,7 +222,7 @@ def _matrices(system: Any) -> _Matrices:
 
 
 def check_lag(lag: int) -> None:
-    if lag < 1:
+    if not is_count(lag):
         raise InputError(f"The lag is how many Markov parameters there are, at least 1, but is {lag}.")
 
 

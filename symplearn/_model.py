@@ -12,8 +12,10 @@ from jaxtyping import Array, Float, Int, PyTree
 
 import integrators as ig
 
+from ._counts import refuse_count
 from ._errors import InputError
-from ._noise import enter
+from ._model_checks import refuse_asymmetric, refuse_matrix, refuse_misfit, shape_of
+from ._noise import AdditiveGaussian, WienerIncrement, enter
 from ._parameters import AbstractKnown
 from ._small_products import product
 from ._transforms import AbstractTransform, Images, Moments
@@ -24,10 +26,27 @@ class Gaussian(AbstractKnown):
     """A normal distribution: `mean` of shape (d,) and `covariance` of shape (d, d), which may be singular.
 
     Bare arrays are known; `Gaussian(Learnt(mean), covariance)` learns the mean.
+
+    **Raises:** `InputError` where the covariance is not square, not symmetric, or not of the mean's length.
     """
 
     mean: Any
     covariance: Any
+
+    def __check_init__(self):
+        refuse_asymmetric("Gaussian", "covariance", self.covariance)
+        mean, covariance = shape_of(self.mean), shape_of(self.covariance)
+        if mean is not None and covariance is not None and mean != covariance[:-1]:
+            raise InputError(
+                f"`Gaussian` needs a mean (d,) and a covariance (d, d), but was given the shapes {mean} and "
+                f"{covariance}; make them of one length."
+            )
+
+    @property
+    def size(self) -> int | None:
+        """d, or None where it cannot be told."""
+        shape = shape_of(self.mean)
+        return shape[-1] if shape else None
 
     @property
     def root(self) -> Float[Array, "d d"]:
@@ -86,17 +105,33 @@ class AbstractAffine(eqx.Module):
 class LinearDynamics(AbstractAffine):
     """x' = A x + B u, the dynamics of (3.1): A (state, state), B (state, input) or None. One step per data interval.
 
-    **Raises:** `InputError` where B is given and the recording has no inputs.
+    **Raises:** `InputError` where A is not square or B has not as many rows; and, in use, where B is given and the
+    recording has no inputs.
     """
 
     A: Any
     B: Any = None
+
+    def __check_init__(self):
+        refuse_matrix("LinearDynamics", "A", self.A, is_square=True)
+        _refuse_rows("LinearDynamics", ("A", self.A), ("B", self.B))
 
     def slope(self, x: Float[Array, " state"]) -> Float[Array, "state state"]:
         return jnp.asarray(self.A)
 
     def __call__(self, x: Float[Array, " state"], interval: Any = None) -> Float[Array, " state"]:
         return product(jnp.asarray(self.A), x) + _driven(self.B, interval, x.shape[0], "LinearDynamics")
+
+
+def _refuse_rows(owner: str, first: tuple[str, Any], second: tuple[str, Any]) -> None:
+    """Refuse two matrices whose products would be added, but whose rows are not as many."""
+    refuse_matrix(owner, *second)
+    (a, one), (b, other) = ((name, shape_of(given)) for name, given in (first, second))
+    if one and other and one[-2] != other[-2]:
+        raise InputError(
+            f"`{owner}` needs {a} and {b} of as many rows, but was given the shapes {one} and {other}; give {b} "
+            f"{one[-2]} rows."
+        )
 
 
 def _driven(matrix: Any, context: Any, size: int, owner: str) -> Array:
@@ -119,7 +154,8 @@ class Propagator(eqx.Module):
     **Arguments:** `system` - a Hamiltonian or a forced system of `integrators`; `integrator` - for example
     `integrators.Leapfrog()`; `substeps` - integrator steps per data interval, a whole number of at least 1.
 
-    **Raises:** `TypeError` where the integrator cannot step the system.
+    **Raises:** `InputError` where `substeps` is no such number; `TypeError` where the integrator cannot step the
+    system.
     """
 
     system: Any
@@ -127,8 +163,7 @@ class Propagator(eqx.Module):
     substeps: int = eqx.field(static=True, default=1)
 
     def __check_init__(self):
-        if self.substeps < 1:
-            raise ValueError(f"`Propagator` needs at least one substep, but was given {self.substeps}.")
+        refuse_count("Propagator", "substeps", self.substeps)
         self.integrator.accepts(self.system)
 
     def __call__(self, x: Float[Array, " state"], interval: Interval) -> Float[Array, " state"]:
@@ -155,15 +190,39 @@ class FullState(AbstractAffine):
         return x
 
 
-class Coordinates(AbstractAffine):
-    """Some entries of the state are read: h(x) = x[indices]; `Coordinates((0,))` reads q_0 of [q, p]."""
+def _as_tuple(indices: Any) -> Any:
+    if not isinstance(indices, list | tuple | np.ndarray) or len(np.shape(indices)) != 1 or not len(indices):
+        raise InputError(f"`Coordinates` needs a tuple of indices, such as (0,), but was given {indices!r}.")
+    return tuple(indices.tolist() if isinstance(indices, np.ndarray) else indices)
 
-    indices: tuple[int, ...] = eqx.field(static=True)
+
+class Coordinates(AbstractAffine):
+    """Some entries of the state are read: h(x) = x[indices]; `Coordinates((0,))` reads q_0 of [q, p].
+
+    **Raises:** `InputError` where an index is no whole number of at least 0; and, as soon as the size of the state is
+    known, where the state has no such entry.
+    """
+
+    indices: tuple[int, ...] = eqx.field(static=True, converter=_as_tuple)
+
+    def __check_init__(self):
+        for index in self.indices:
+            refuse_count("Coordinates", "indices", index, least=0)
+
+    def refuse_beyond(self, state: int) -> None:
+        """Refuse, with `InputError`, an index that a state of this size has not: JAX would read its last entry."""
+        if self.indices and max(self.indices) >= state:
+            raise InputError(
+                f"`Coordinates` reads entry {max(self.indices)}, counted from 0, but the state has {state} numbers; "
+                f"give indices from 0 to {state - 1}."
+            )
 
     def slope(self, x: Float[Array, " state"]) -> Float[Array, "channel state"]:
+        self.refuse_beyond(x.shape[0])
         return jnp.eye(x.shape[0])[np.asarray(self.indices)]
 
     def __call__(self, x: Float[Array, " state"], context: Any = None) -> Float[Array, " channel"]:
+        self.refuse_beyond(x.shape[0])
         # Known places, which a machine's registers need.
         return x[np.asarray(self.indices)]
 
@@ -171,11 +230,16 @@ class Coordinates(AbstractAffine):
 class LinearObservation(AbstractAffine):
     """A linear reading: h(x, u) = matrix x + feedthrough u, the H (channel, state) and D (channel, input) of (3.1).
 
-    **Raises:** `InputError` where a feedthrough is given and the recording has no inputs.
+    **Raises:** `InputError` where `matrix` is none or the feedthrough has not as many rows; and, in use, where a
+    feedthrough is given and the recording has no inputs.
     """
 
     matrix: Any
     feedthrough: Any = None
+
+    def __check_init__(self):
+        refuse_matrix("LinearObservation", "matrix", self.matrix)
+        _refuse_rows("LinearObservation", ("matrix", self.matrix), ("feedthrough", self.feedthrough))
 
     def slope(self, x: Float[Array, " state"]) -> Float[Array, "channel state"]:
         return jnp.asarray(self.matrix)
@@ -231,6 +295,8 @@ class StateSpaceModel(AbstractStateSpaceModel):
     - `initial`: a `Gaussian` for the state at the first reading, or one for each of several recordings, in a tuple.
       None means a flat prior, which only a model that reads its `FullState` can have: the first reading is then
       conditioned on (Remark 1 after Theorem 2).
+
+    **Raises:** `InputError` where a part is not for a state of the initial distribution's size.
     """
 
     dynamics: Callable[[Any, Any], Any]
@@ -239,15 +305,42 @@ class StateSpaceModel(AbstractStateSpaceModel):
     measurement_noise: Any
     initial: Any = None
 
+    def __check_init__(self):
+        for one in self.initial if isinstance(self.initial, tuple) else (self.initial,):
+            if isinstance(one, Gaussian) and one.size is not None:
+                self._refuse_misfits(one.size)
+
+    def _refuse_misfits(self, state: int) -> None:
+        if isinstance(self.dynamics, LinearDynamics):
+            refuse_misfit("dynamics", _columns(self.dynamics.A), state)
+        if isinstance(self.observation, LinearObservation):
+            refuse_misfit("observation", _columns(self.observation.matrix), state)
+        if isinstance(self.observation, Coordinates):
+            self.observation.refuse_beyond(state)
+        refuse_misfit("process noise", _size_of(self.process_noise), state)
+
     @property
     def reads_exactly(self) -> bool:
         return isinstance(self.observation, AbstractAffine)
 
     def predict(self, transform, mean, root, interval) -> Moments:
-        return enter(self.process_noise, _pass(transform, self.dynamics, mean, root, interval), interval)
+        moved = _pass(transform, self.dynamics, mean, root, interval)
+        refuse_misfit("process noise", _size_of(self.process_noise), moved.mean.shape[0])
+        return enter(self.process_noise, moved, interval)
 
     def read(self, transform, mean, root, context) -> Moments:
         return enter(self.measurement_noise, _pass(transform, self.observation, mean, root, context), context)
+
+
+def _columns(matrix: Any) -> int | None:
+    shape = shape_of(matrix)
+    return shape[-1] if shape else None
+
+
+def _size_of(noise: Any) -> int | None:
+    """How many numbers a noise is of, or None where that cannot be told."""
+    known = isinstance(noise, AdditiveGaussian | WienerIncrement)
+    return getattr(noise.structure, "size", None) if known else None
 
 
 def _pass(transform: AbstractTransform, part: Any, mean: Array, root: Array, record: Any) -> Moments:

@@ -11,7 +11,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 import integrators as ig
 
-from ._errors import InputError
+from ._counts import refuse_count
+from ._keys import refuse_key
 
 
 class AbstractInitialisation(eqx.Module):
@@ -84,11 +85,9 @@ class NSSNN(ig.AbstractHamiltonian):
         key: PRNGKeyArray,
         initialisation: AbstractInitialisation | None = None,
     ):
-        if min(dim, width, depth - 1) < 1:
-            raise InputError(
-                f"`NSSNN` needs dim and width of at least 1 and a depth of at least 2, but was given dim={dim}, "
-                f"width={width}, depth={depth}."
-            )
+        refuse_key(key)
+        for name, given, least in (("dim", dim, 1), ("width", width, 1), ("depth", depth, 2)):
+            refuse_count("NSSNN", name, given, least)
         draw = AuthorsInitialisation() if initialisation is None else initialisation
         sizes = [2 * dim, *[width] * (depth - 1), 1]
         keys = jax.random.split(key, depth)

@@ -11,7 +11,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ._counts import refuse_count
 from ._errors import InputError
+from ._model_checks import refuse_asymmetric, shape_of
 from ._parameters import AbstractKnown, AbstractParameter
 from ._small_products import product
 from ._transforms import Moments, with_noise
@@ -58,6 +60,12 @@ def _deviation(number: Any) -> Array:
     return jnp.exp(0.5 * number.log_variance) if isinstance(number, LogVariance) else _root(number)
 
 
+def _shape_of(number: Any) -> tuple[int, ...] | None:
+    if isinstance(number, StandardDeviation):
+        return shape_of(number.sd)
+    return shape_of(number.log_variance if isinstance(number, LogVariance) else number)
+
+
 class AbstractCovariance(AbstractKnown):
     """A covariance matrix of size (dim, dim) and a square root of it."""
 
@@ -71,12 +79,27 @@ class AbstractCovariance(AbstractKnown):
     def root(self) -> Float[Array, "dim dim"]:
         """Lower triangular, root root' = matrix."""
 
+    @property
+    def size(self) -> int | None:
+        """`dim`, or None where it cannot be told without computing the matrix."""
+        return None
+
 
 class ScaledIdentity(AbstractCovariance):
-    """The covariance `variance` times the identity of size `dim`."""
+    """The covariance `variance` times the identity of size `dim`.
+
+    **Raises:** `InputError` where `dim` is no whole number of at least 1.
+    """
 
     variance: Any = eqx.field(converter=_number)
     dim: int = eqx.field(static=True)
+
+    def __check_init__(self):
+        refuse_count("ScaledIdentity", "dim", self.dim)
+
+    @property
+    def size(self) -> int | None:
+        return self.dim
 
     @property
     def matrix(self) -> Float[Array, "dim dim"]:
@@ -88,9 +111,21 @@ class ScaledIdentity(AbstractCovariance):
 
 
 class Diagonal(AbstractCovariance):
-    """The covariance with `variances` (dim,) on its diagonal."""
+    """The covariance with `variances` (dim,) on its diagonal.
+
+    **Raises:** `InputError` where the variances are no vector.
+    """
 
     variances: Any = eqx.field(converter=_number)
+
+    def __check_init__(self):
+        if _shape_of(self.variances) == ():
+            raise InputError("`Diagonal` needs a vector of variances, but was given one number; use `ScaledIdentity`.")
+
+    @property
+    def size(self) -> int | None:
+        shape = _shape_of(self.variances)
+        return shape[-1] if shape else None
 
     @property
     def matrix(self) -> Float[Array, "dim dim"]:
@@ -102,9 +137,20 @@ class Diagonal(AbstractCovariance):
 
 
 class Dense(AbstractCovariance):
-    """A covariance (dim, dim), symmetric and positive semi-definite; `PositiveDefinite` learns one."""
+    """A covariance (dim, dim), symmetric and positive semi-definite; `PositiveDefinite` learns one.
+
+    **Raises:** `InputError` where it is not square or not symmetric.
+    """
 
     covariance: Any = eqx.field(converter=_number)
+
+    def __check_init__(self):
+        refuse_asymmetric("Dense", "covariance", self.covariance)
+
+    @property
+    def size(self) -> int | None:
+        shape = shape_of(self.covariance)
+        return shape[-1] if shape else None
 
     @property
     def matrix(self) -> Float[Array, "dim dim"]:
@@ -120,10 +166,20 @@ class Correlated(AbstractCovariance):
 
     A dense covariance whose `variances` may be wrapped as those of `Diagonal`; `Correlation` learns the rest:
     `Correlated(StandardDeviation(Positive(sds)), Correlation(matrix))` (Barnard, McCulloch and Meng 2000).
+
+    **Raises:** `InputError` where the correlation is not square or not symmetric.
     """
 
     variances: Any = eqx.field(converter=_number)
     correlation: Any = eqx.field(converter=_number)
+
+    def __check_init__(self):
+        refuse_asymmetric("Correlated", "correlation", self.correlation)
+
+    @property
+    def size(self) -> int | None:
+        shape = shape_of(self.correlation)
+        return shape[-1] if shape else None
 
     @property
     def matrix(self) -> Float[Array, "dim dim"]:

@@ -46,8 +46,14 @@ class TimeSeries(eqx.Module):
 def as_time_series(recording: Any) -> TimeSeries:
     """The times, readings and inputs of a recording as arrays, checked.
 
-    **Raises:** `InputError` where shapes disagree, times do not increase or there are fewer than two rows.
+    **Raises:** `InputError` where there are no times and readings, shapes disagree, times do not increase or there are
+    fewer than two rows.
     """
+    if not (hasattr(recording, "times") and hasattr(recording, "readings")):
+        raise InputError(
+            f"A recording needs `times` and `readings`, but a `{type(recording).__name__}` has none; give "
+            "`TimeSeries(times, readings)`, or what `read_recordings` gives."
+        )
     times, readings, inputs = recording.times, recording.readings, getattr(recording, "inputs", None)
     if isinstance(times, jax.core.Tracer):
         return TimeSeries(times, readings, inputs)

@@ -61,16 +61,17 @@ class Learnt(AbstractParameter):
 class Positive(AbstractParameter):
     """A positive number or array that learns, through its logarithm. `value` is where it starts.
 
-    **Raises:** `InputError` where an entry is not positive.
+    **Raises:** `InputError` where an entry is not positive and finite.
     """
 
     free: Array
 
     def __init__(self, value: Any):
         value = jnp.asarray(value, dtype=float)
+        require(jnp.isfinite(value), "`Positive` needs finite numbers, but was given NaN or infinity; give a start.")
         require(
             value > 0,
-            "`Positive` needs positive numbers, but was given 0 or less. Use `Learnt` for any sign.",
+            "`Positive` needs positive numbers, but was given 0 or less; use `Learnt` for any sign.",
         )
         self.free = jnp.log(value)
 

@@ -14,10 +14,12 @@ import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
+from ._counts import refuse_count
 from ._distributions import MultivariateNormal
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
 from ._hidden_markov import HiddenMarkovModel
+from ._keys import refuse_key
 from ._model import AbstractStateSpaceModel, slice_at
 from ._noise import Additive, Dense, Multiplicative
 from ._parameters import resolve
@@ -152,8 +154,8 @@ def particle_filter(
     **Raises:** `InputError` where the density of a reading is not known, a noise cannot be drawn, sizes do not fit, or
     the model has no initial distribution.
     """
-    if particles < 2:
-        raise InputError(f"`particle_filter` needs at least 2 particles, but was given {particles}.")
+    refuse_key(key)
+    refuse_count("particle_filter", "particles", particles, least=2)
     return _filter(resolve(model), jnp.asarray(readings), intervals, contexts, key, particles, resampling)
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ._errors import InputError
 from ._fit import Estimate
+from ._keys import refuse_key
 from ._modes import Mode
 from ._paths import Choice, Task, paths_of_many, paths_of_one, task_of
 from ._posterior import Posterior
@@ -105,6 +106,7 @@ def posterior_forecast(
     choice = Choice(process_noise, measurement_noise, in_sample)
     task = task_of(estimate, choice, recording, times, until, substeps, inputs)
     count = min(_DRAWS, len(posterior.draws())) if draws is None else draws
+    refuse_key(key)
     keys = jax.random.split(key, count)
     return _checked(task, estimate, keys, *paths_of_many(task, posterior.models(count), keys))
 
@@ -139,6 +141,7 @@ def stochastic_forecast(
         raise InputError("`filtered` paths start at the readings; ask for them with `in_sample=True`.")
     choice = Choice(True, measurement_noise, in_sample, state_spread, filtered)
     task = task_of(estimate, choice, recording, times, until, substeps, inputs)
+    refuse_key(key)
     keys = jax.random.split(key, draws)
     return _checked(task, estimate, keys, *paths_of_one(task, estimate.model, keys))
 

@@ -37,7 +37,8 @@ class RandomWalk(AbstractBlockSampler):
     scout: AdaptiveImportance = SCOUT
 
     def __check_init__(self):
-        refuse_counts(self, chains=2, thin=1, steps=4 * self.thin)
+        refuse_counts(self, chains=2, thin=1)
+        refuse_counts(self, steps=4 * self.thin)
 
     def draw_in(self, course: Course, density: LogDensity, start: Whitening, key: PRNGKeyArray) -> Drawn:
         plan = Plan(self.steps // 4, self.steps // self.thin, self.thin)

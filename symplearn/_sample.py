@@ -14,9 +14,10 @@ from ._errors import InputError
 from ._fit import Estimate
 from ._funnel import Straightened, bent_back, funnel_of
 from ._importance import AdaptiveImportance
+from ._keys import refuse_key
 from ._parameters import flatten
 from ._posterior import Posterior, log_posterior_of, posterior_of
-from ._sampler import AbstractBlockSampler, AbstractSampler, Drawn, LogDensity
+from ._sampler import AbstractBlockSampler, AbstractSampler, Drawn, LogDensity, refuse_sampler
 from ._small_arrays import on_one_thread
 from ._whitening import Whitening, standard, whiten
 
@@ -45,10 +46,12 @@ def sample(
     at all. Where it exists, sampling goes on from it and ends at the same draws, to the last bit, as without the stop;
     a scouting run that was stopped is done again.
 
-    **Raises:** `InputError` where the estimate's log posterior is not finite, the checkpoint is damaged or of another
-    computation, or the sampler has no blocks to keep.
+    **Raises:** `InputError` where `sampler` is none or `key` no key, the estimate's log posterior is not finite, the
+    checkpoint is damaged or of another computation, or the sampler has no blocks to keep.
     """
     sampler = AdaptiveImportance() if sampler is None else sampler
+    refuse_sampler(sampler)
+    refuse_key(key)
     density, centre = log_posterior_of(estimate), flatten(estimate.model)[0]
     known_by = (density, centre)
     funnel = None if sampler.by_place else funnel_of(estimate, density)
@@ -83,6 +86,8 @@ def sample_density(
     if start.ndim != 1 or start.size == 0:
         raise InputError(f"`sample_density` needs a vector to start from, but was given the shape {start.shape}.")
     sampler = AdaptiveImportance() if sampler is None else sampler
+    refuse_sampler(sampler)
+    refuse_key(key)
     around = whiten(log_density, start)
     return posterior_of(
         None, _drawn(log_density, around, sampler, key, checkpoint, (log_density, around)), str(sampler)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ._blocks import Course
+from ._counts import refuse_count
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
 from ._fit import guarded
@@ -108,11 +109,16 @@ def at_each(density: LogDensity, places: Float[Array, "place parameter"]) -> Flo
 
 
 def refuse_counts(sampler: AbstractSampler, **least: int) -> None:
-    """Refuse an option of a sampler that is below the least that works."""
+    """Refuse an option of a sampler that is no whole number, or below the least that works."""
     for name, lowest in least.items():
-        given = getattr(sampler, name)
-        if given < lowest:
-            raise InputError(f"`{type(sampler).__name__}` needs `{name}` of at least {lowest}, but was given {given}.")
+        refuse_count(type(sampler).__name__, name, getattr(sampler, name), lowest)
+
+
+def refuse_sampler(given: Any) -> None:
+    """Refuse, with `InputError`, what is no sampler: its name in a string, or its class."""
+    if not isinstance(given, AbstractSampler):
+        shown = f"the class `{given.__name__}`" if isinstance(given, type) else f"{str(given):.60}"
+        raise InputError(f"A sampler is an object with its options, such as `NUTS()`, but {shown} was given.")
 
 
 def generator(key: PRNGKeyArray) -> np.random.Generator:

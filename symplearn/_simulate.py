@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ._errors import InputError
 from ._hidden_markov import HiddenMarkovModel
+from ._keys import refuse_key
 from ._model import AbstractStateSpaceModel, Instant, Interval, StateSpaceModel, intervals_between, slice_at
 from ._noise import Additive, Multiplicative
 from ._objectives import TimeSeries
@@ -29,6 +30,7 @@ def simulate(
     **Raises:** `InputError` where the model has no single initial distribution, a noise cannot be drawn, sizes do not
     fit, times do not increase, or the state leaves the reals.
     """
+    refuse_key(key)
     times = jnp.asarray(times, dtype=float)
     inputs = None if inputs is None else jnp.asarray(inputs, dtype=float)
     _refuse_times(times, inputs)

@@ -17,6 +17,7 @@ import scipy.linalg
 import scipy.sparse
 from jaxtyping import Array, Float
 
+from ._counts import refuse_count
 from ._errors import InputError
 from ._hamiltonians import MONOMIALS, exponents
 from ._model import Interval
@@ -36,10 +37,17 @@ def _names(dim: int) -> list[str]:
 
 
 class PolynomialLibrary(eqx.Module):
-    """All monomials of total degree 0..`degree` in `dim` variables, low degrees first; 10 for dim 2 and degree 3."""
+    """All monomials of total degree 0..`degree` in `dim` variables, low degrees first; 10 for dim 2 and degree 3.
+
+    **Raises:** `InputError` where `dim` or `degree` is no whole number of at least 1, or of 0.
+    """
 
     dim: int = eqx.field(static=True)
     degree: int = eqx.field(static=True)
+
+    def __check_init__(self):
+        refuse_count("PolynomialLibrary", "dim", self.dim)
+        refuse_count("PolynomialLibrary", "degree", self.degree, least=0)
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -93,14 +101,15 @@ class ForwardEuler(eqx.Module):
     """Dynamics x + dt f(x), repeated `substeps` times (at least 1) in each data interval. Dissertation (4.4).
 
     `field` is called `(x)`, such as a `SparseModel`.
+
+    **Raises:** `InputError` where `substeps` is no whole number of at least 1.
     """
 
     field: Callable[[Any], Any]
     substeps: int = eqx.field(static=True, default=1)
 
     def __check_init__(self):
-        if self.substeps < 1:
-            raise ValueError(f"`ForwardEuler` needs at least one substep, but was given {self.substeps}.")
+        refuse_count("ForwardEuler", "substeps", self.substeps)
 
     def __call__(self, x: Float[Array, " state"], interval: Interval) -> Float[Array, " state"]:
         dt = interval.length / self.substeps

@@ -19,8 +19,10 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from ._blocks import Course, run_blocks
 from ._checkpoint import Checkpoint, seal_of
+from ._counts import refuse_count
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
+from ._keys import refuse_key
 from ._objectives import AbstractObjective, TimeSeries, as_recordings
 from ._optimisers import AbstractOptimiser
 from ._parameters import named_parameters, partition, value_of
@@ -237,8 +239,8 @@ def train(
     several = isinstance(recordings, list | tuple)
     if not named_parameters(model):
         raise InputError("Nothing in the model learns: every number is known or `Frozen`. Wrap one in `Positive`.")
-    if epochs < 1:
-        raise InputError(f"`train` needs at least one epoch, but was given {epochs}.")
+    refuse_count("train", "epochs", epochs)
+    refuse_key(key)
     given = series if several else series[0]
     training = Training(objective, prior, optimiser, steps_of(objective, series))
     settings = repr(optimiser) if isinstance(optimiser, AbstractOptimiser) else "optax"

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ._counts import refuse_count
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
 from ._guard import guard
@@ -33,14 +34,13 @@ class AbstractSegmentation(eqx.Module):
 class EverySteps(AbstractSegmentation):
     """Segments of `length` data intervals, the T of (4.9); the last one may be shorter.
 
-    **Raises:** `ValueError` where `length` is less than 1.
+    **Raises:** `InputError` where `length` is no whole number of at least 1.
     """
 
     length: int = eqx.field(static=True)
 
     def __check_init__(self):
-        if self.length < 1:
-            raise ValueError(f"`EverySteps` needs segments of at least 1 data interval, but was given {self.length}.")
+        refuse_count("EverySteps", "length", self.length)
 
     def starts(self, intervals: int) -> tuple[int, ...]:
         return tuple(range(0, intervals, self.length))

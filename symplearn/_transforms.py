@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._counts import refuse_count
 from ._small_products import product
 
 # Points of a Gauss-Hermite grid beyond which a particle filter would be the better tool.
@@ -152,14 +153,14 @@ class GaussHermite(AbstractTransform):
 
     It takes order^d points: for few dimensions.
 
-    **Raises:** `ValueError` where the order is below 2 or the grid has more than 50,000 points.
+    **Raises:** `InputError` where the order is no whole number of at least 2; `ValueError` where the grid has more than
+    50,000 points.
     """
 
     order: int = eqx.field(static=True, default=5)
 
     def __check_init__(self):
-        if self.order < 2:
-            raise ValueError(f"`GaussHermite` needs an order of at least 2, but was given {self.order}.")
+        refuse_count("GaussHermite", "order", self.order, least=2)
 
     def __call__(self, function, mean, root) -> Moments:
         dim = mean.shape[0]

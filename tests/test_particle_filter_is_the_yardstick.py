@@ -301,4 +301,4 @@ def test_what_has_no_density_is_refused():
     refused(HiddenMarkovModel(Added(Hill()), Added(Bent()), draws, draws, initial), "log_density_of_reading")
     refused(StateSpaceModel(Hill(), Bent(), added, Additive(Uniform(0.0, 1.0, 3)), initial), "dim=1")
     refused(StateSpaceModel(Hill(), Bent(), added, added), "initial")
-    refused(StateSpaceModel(Hill(), Bent(), added, added, initial), "at least 2 particles", particles=1)
+    refused(StateSpaceModel(Hill(), Bent(), added, added, initial), "`particles` of at least 2", particles=1)

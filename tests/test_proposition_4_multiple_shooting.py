@@ -217,7 +217,7 @@ def test_wrong_segments_are_one_clear_sentence():
     with pytest.raises(InputError, match="no reading at all"):
         blind = TimeSeries(SERIES.times, SERIES.readings.at[:, 0].set(jnp.nan))
         segment_starts(pendulum(None), blind, EverySteps(4))
-    with pytest.raises(ValueError, match="at least 1"):
+    with pytest.raises(InputError, match="at least 1"):
         EverySteps(0)
     with pytest.raises(ValueError, match="increasing indices from 0"):
         StartingAt((0, 4, 4))

@@ -315,7 +315,7 @@ def test_forward_euler_steps_the_field():
     central = [(stepped(x + h, 3) - stepped(x - h, 3)) / 2e-5 for h in 1e-5 * np.eye(2)]
     slope = jax.jit(jax.jacrev(lambda x: step(x, span)))(jnp.asarray(x))
     np.testing.assert_allclose(slope, np.array(central).T, atol=1e-8)
-    with pytest.raises(ValueError, match="at least one substep"):
+    with pytest.raises(InputError, match="`substeps` of at least 1"):
         ForwardEuler(step.field, 0)
 
 

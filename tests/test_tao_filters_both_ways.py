@@ -303,7 +303,7 @@ def test_what_has_no_doubled_twin_is_refused_in_a_sentence():
         doubled(StateSpaceModel(model.dynamics, FullState(), model.process_noise, model.measurement_noise))
     with pytest.raises(InputError, match="`Multiplicative`"):
         DoubledNoise(Multiplicative(_Shifted()))
-    with pytest.raises(InputError, match="at least one substep"):
+    with pytest.raises(InputError, match="`substeps` of at least 1"):
         DoubledPropagator(TAO, MEAN, 0)
 
 

@@ -187,7 +187,7 @@ def test_the_propagator_is_the_trajectory():
     assert np.array_equal(Coordinates((1, 0))(x), x[::-1])
     with pytest.raises(TypeError, match="separable"):
         Propagator(ig.problems.Cherry(), ig.Leapfrog())
-    with pytest.raises(ValueError, match="at least one substep"):
+    with pytest.raises(InputError, match="`substeps` of at least 1"):
         Propagator(ig.problems.Cherry(), ig.Tao(), substeps=0)
 
 

@@ -190,7 +190,7 @@ def test_bad_input_is_one_sentence():
     given = dict(prior=Flat(), optimiser=Adam(), key=KEY)
     with pytest.raises(InputError, match="Nothing in the model learns"):
         _train.train(Place(1.0), recording(), Walled(), epochs=1, **given)
-    with pytest.raises(InputError, match="at least one epoch"):
+    with pytest.raises(InputError, match="`epochs` of at least 1"):
         _train.train(Place(jnp.zeros(())), recording(), Walled(), epochs=0, **given)
     with pytest.raises(InputError, match="No step of the training had a possible score"):
         _train.train(Place(jnp.asarray(2.0)), recording(), Walled(), epochs=2, **given)

@@ -197,7 +197,7 @@ def test_what_cannot_be_done_is_refused():
         kalman_filter(pendulum(FullState()), jnp.zeros((N, 2)), SPANS)
     with pytest.raises(ValueError, match="takes 5\\^8 points in 8 dimensions"):
         GaussHermite(5)(jnp.sin, jnp.zeros(8), jnp.eye(8))
-    with pytest.raises(ValueError, match="order of at least 2"):
+    with pytest.raises(InputError, match="`order` of at least 2"):
         GaussHermite(1)
 
 

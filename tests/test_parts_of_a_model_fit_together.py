@@ -1,0 +1,187 @@
+"""What cannot be part of a model, or does not fit the others, is refused in a sentence as soon as it can be known."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxtyping
+import numpy as np
+import pytest
+
+import integrators as ig
+import symplearn as sl
+from symplearn import InputError
+
+A = np.array([[1.0, 0.2], [-0.5, 0.9]])
+ASYMMETRIC = np.array([[1.0, 2.0], [0.0, 5.0]])
+RECORDING = sl.TimeSeries(np.arange(5.0), np.zeros((5, 1)))
+
+
+@pytest.fixture(autouse=True)
+def _as_users_have_it(monkeypatch):
+    """The tests' own check of annotations, which a user does not have, would speak first."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+def model(dynamics=None, observation=None, noise=None, mean=None, covariance=None):
+    """A linear model of two numbers, one of them read, with some part of it in another's place."""
+    return sl.StateSpaceModel(
+        sl.LinearDynamics(A) if dynamics is None else dynamics,
+        sl.Coordinates((0,)) if observation is None else observation,
+        sl.AdditiveGaussian(sl.ScaledIdentity(0.1, dim=2)) if noise is None else noise,
+        sl.AdditiveGaussian(sl.ScaledIdentity(0.1, dim=1)),
+        sl.Gaussian(np.zeros(2) if mean is None else mean, np.eye(2) if covariance is None else covariance),
+    )
+
+
+def noise(structure):
+    """Process noise of that structure."""
+    return sl.AdditiveGaussian(structure)
+
+
+MISFITS = {
+    "an entry beyond the state": (lambda: model(observation=sl.Coordinates((2,))), "reads entry 2, .* has 2 numbers"),
+    "dynamics of three": (lambda: model(sl.LinearDynamics(np.eye(3))), "dynamics is for 3 numbers, .* has 2"),
+    "reading of three": (lambda: model(observation=sl.LinearObservation(np.ones((1, 3)))), "observation is for 3"),
+    "identity of one": (lambda: model(noise=noise(sl.ScaledIdentity(0.1, dim=1))), "process noise is for 1 numbers"),
+    "three variances": (lambda: model(noise=noise(sl.Diagonal(np.ones(3)))), "process noise is for 3"),
+    "wrapped variances": (
+        lambda: model(noise=sl.WienerIncrement(sl.Diagonal(sl.StandardDeviation(sl.Positive(np.ones(3)))))),
+        "process noise is for 3",
+    ),
+    "a learnt covariance": (lambda: model(noise=noise(sl.Dense(sl.PositiveDefinite(np.eye(3))))), "noise is for 3"),
+    "correlated": (lambda: model(noise=noise(sl.Correlated(np.ones(3), np.eye(3)))), "process noise is for 3"),
+    "a longer start": (lambda: model(mean=sl.Learnt(np.zeros(3)), covariance=np.eye(3)), "is for 2 .* has 3"),
+}
+
+
+@pytest.mark.parametrize("build, said", MISFITS.values(), ids=MISFITS.keys())
+def test_parts_of_other_sizes(build, said):
+    """A part that is for a state of another size than the initial distribution's is named when the model is built."""
+    with pytest.raises(InputError, match=said):
+        build()
+
+
+def test_sizes_that_the_recording_tells():
+    """Without an initial distribution the state is as large as a reading, and the process noise is held against it."""
+    parts = sl.LinearDynamics(A), sl.FullState(), noise(sl.ScaledIdentity(0.1, dim=1))
+    open_start = sl.StateSpaceModel(*parts, sl.AdditiveGaussian(sl.ScaledIdentity(0.1, dim=2)))
+    with pytest.raises(InputError, match="process noise is for 1 numbers, but the state has 2"):
+        sl.MarginalLikelihood()(open_start, sl.TimeSeries(np.arange(5.0), np.zeros((5, 2))))
+
+
+def test_entries_of_a_state_that_comes_later():
+    """Coordinates that are used by themselves are held against the state they are given, under `jit` too."""
+    with pytest.raises(InputError, match="reads entry 5"):
+        jax.jit(sl.Coordinates((0, 5)))(jnp.zeros(4))
+    with pytest.raises(InputError, match="from 0 to 3"):
+        sl.Coordinates((4,)).slope(jnp.zeros(4))
+    assert sl.Coordinates([1, 3])(jnp.arange(4.0)).tolist() == [1.0, 3.0]
+
+
+ODD = {
+    "negative": (lambda: sl.Coordinates((-1,)), "`indices` of at least 0"),
+    "fraction": (lambda: sl.Coordinates((0.5,)), "`indices` of at least 0, a whole number, but was given 0.5"),
+    "number": (lambda: sl.Coordinates(0), r"such as \(0,\), but was given 0"),
+    "none": (lambda: sl.Coordinates(()), r"such as \(0,\)"),
+    "A of two rows": (lambda: sl.LinearDynamics(np.ones((2, 3))), r"square matrix \(d, d\) as its A"),
+    "A a vector": (lambda: sl.LinearDynamics(np.ones(2)), "square matrix"),
+    "B of three rows": (lambda: sl.LinearDynamics(A, np.ones((3, 1))), "B of as many rows"),
+    "D of two rows": (lambda: sl.LinearObservation(np.ones((1, 2)), np.ones((2, 1))), "give feedthrough 1 rows"),
+    "H a vector": (lambda: sl.LinearObservation(np.ones(2)), "needs a matrix as its matrix"),
+    "variances a number": (lambda: sl.Diagonal(0.1), "vector of variances"),
+    "no identity": (lambda: sl.ScaledIdentity(0.1, dim=0), "`dim` of at least 1"),
+    "covariance a number": (lambda: sl.Gaussian(np.zeros(2), 2.0), r"square matrix .* shape \(\)"),
+    "covariance a vector": (lambda: sl.Gaussian(np.zeros(2), np.ones(2)), "square matrix"),
+    "mean of three": (lambda: sl.Gaussian(np.zeros(3), np.eye(2)), r"shapes \(3,\) and \(2, 2\)"),
+    "one coefficient short": (lambda: sl.PolynomialPotential(1, 4, np.ones(3)), "4 terms needs as many"),
+    "learnt ones short": (lambda: sl.Polynomial(1, 2, sl.Learnt(np.ones(4))), "5 terms needs as many"),
+    "degree of zero": (lambda: sl.PolynomialPotential(1, 0), "`degree` of at least 1"),
+    "degree below": (lambda: sl.PolynomialPotential(1, -1), "`degree` of at least 1"),
+    "no dimension": (lambda: sl.Polynomial(0, 2), "`dim` of at least 1"),
+    "not a number": (lambda: sl.Positive(np.nan), "given NaN or infinity"),
+    "zero": (lambda: sl.Positive(0.0), "given 0 or less"),
+}
+
+
+@pytest.mark.parametrize("build, said", ODD.values(), ids=ODD.keys())
+def test_parts_that_are_none(build, said):
+    """What can be no part of any model says so when it is made."""
+    with pytest.raises(InputError, match=said):
+        build()
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda matrix: sl.Gaussian(np.zeros(2), matrix),
+        lambda matrix: sl.Gaussian(sl.Learnt(np.zeros(2)), sl.Frozen(matrix)),
+        sl.Dense,
+        lambda matrix: sl.Correlated(np.ones(2), matrix),
+    ],
+)
+def test_covariances_are_symmetric(build):
+    """Of an asymmetric covariance one triangle would be ignored: it is refused; rounding is not."""
+    with pytest.raises(InputError, match="2 in row 0, column 1 and 0 across the diagonal"):
+        build(ASYMMETRIC)
+    root = np.random.default_rng(0).normal(size=(2, 2)).astype(np.float32)
+    rounded = root @ np.diag(np.float32([1.0, 1e-3])) @ root.T
+    build(rounded + np.float32([[0.0, 1e-7], [0.0, 0.0]]))  # an error of single precision
+    build(np.array([[np.nan, 1.0], [1.0, 1.0]]))  # the filter's to tell
+
+
+def test_traced_numbers_are_let_through():
+    """Inside a transformation there are shapes to look at and no numbers: parts are built there as before."""
+
+    @jax.jit
+    def score(matrix, mean):
+        return sl.MarginalLikelihood()(model(sl.LinearDynamics(matrix), mean=mean, covariance=matrix), RECORDING)
+
+    assert np.isfinite(score(np.eye(2), np.ones(2)))
+    stacked = eqx.filter_vmap(lambda mean: sl.Gaussian(mean, jnp.eye(2)))(jnp.ones((4, 2)))
+    assert stacked.mean.shape == (4, 2) and jax.tree.map(lambda leaf: leaf, stacked).mean.shape == (4, 2)
+    with pytest.raises(InputError, match="dynamics is for 3"):
+        jax.jit(lambda a: model(sl.LinearDynamics(a)))(np.eye(3))
+
+
+def potential():
+    """A potential to step."""
+    return sl.PolynomialPotential(1, 2)
+
+
+COUNTS = {
+    "Propagator": lambda n: sl.Propagator(potential(), ig.Leapfrog(), substeps=n),
+    "DoubledPropagator": lambda n: sl.DoubledPropagator(potential(), ig.Tao(1.0), substeps=n),
+    "ForwardEuler": lambda n: sl.ForwardEuler(lambda x: x, substeps=n),
+    "EverySteps": sl.EverySteps,
+    "RandomWalk": lambda n: sl.RandomWalk(thin=n),
+    "NUTS": lambda n: sl.NUTS(draws=n),
+    "GaussHermite": sl.GaussHermite,
+    "NSSNN": lambda n: sl.NSSNN(dim=1, width=n, key=jax.random.key(0)),
+}
+
+
+@pytest.mark.parametrize("given", [2.5, True, "3", 0, None])
+@pytest.mark.parametrize("owner", COUNTS)
+def test_counts_are_whole_numbers(owner, given):
+    """A step that is cut in two and a half integrates over another time: what counts is a whole number."""
+    with pytest.raises(InputError, match=f"`{owner}` needs .* whole number, but was given {given!r}"):
+        COUNTS[owner](given)
+
+
+def test_integrators_count_whole_substeps():
+    """Nor does the mechanics below take a fraction of a step."""
+    with pytest.raises(ValueError, match="whole number from 1 up, but is 2.5"):
+        ig.propagate(potential(), ig.Leapfrog(), jnp.ones(2), 0.0, 1.0, 2.5)
+
+
+def test_recordings_keys_and_samplers_are_what_they_are():
+    """A bare array, a seed and a sampler's name are told from a recording, a key and a sampler."""
+    with pytest.raises(InputError, match="a `ndarray` has none; give `TimeSeries"):
+        sl.dmd(np.ones((5, 2)))
+    with pytest.raises(InputError, match="`jax.random.key"):
+        sl.simulate(model(), np.arange(5.0), 0)
+    with pytest.raises(InputError, match="`jax.random.key"):
+        sl.sample_density(lambda x: -x @ x, jnp.zeros(1), key=0)
+    for wrong in ("NUTS", sl.NUTS):
+        with pytest.raises(InputError, match="an object with its options"):
+            sl.sample_density(lambda x: -x @ x, jnp.zeros(1), sampler=wrong, key=jax.random.key(0))
