@@ -57,7 +57,8 @@ class Posterior:
     the free coordinates (chain, draw, parameter), `log_posterior` (chain, draw) is in nats and not normalised.
     `diagnostics.converged` says whether to trust them, `str(posterior)` what to do if not. `log_evidence` is given by
     samplers that know it, with the standard error `log_evidence_sd`. `estimate` is what was sampled around; None for a
-    density of the user's own, whose one value is called `x`. `sampler` tells which one drew.
+    density of the user's own, whose one value is called `x`, and for draws that were loaded alone. `sampler` tells
+    which one drew.
     """
 
     estimate: Estimate | None
@@ -121,7 +122,10 @@ class Posterior:
         **Raises:** `InputError` for a density of the user's own, or where `count` is not from 1 to the number of draws.
         """
         if self.estimate is None:
-            raise InputError("This posterior is of a density without a model; its draws are in `values`.")
+            raise InputError(
+                "This posterior has no model: it is of a density of your own, or was loaded without its estimate; its "
+                "draws are in `values`, and `load_posterior(path, estimate)` makes models of them."
+            )
         return models_at(self.estimate.model, self.draws(count))
 
     def draws(self, count: int | None = None) -> Float[Array, "draw parameter"]:
@@ -171,8 +175,9 @@ def posterior_of(estimate: Estimate | None, drawn: Drawn, sampler: str) -> Poste
 def load_posterior(path: str | Path, estimate: Estimate | None = None) -> Posterior:
     """Read a posterior that `Posterior.save` wrote.
 
-    **Arguments:** `estimate` - of the same model, recording and prior, from which the draws become models again; None
-    for a density of the user's own.
+    **Arguments:** `estimate` - of the same model, recording and prior, from which the draws become models again, for
+    `models` and `posterior_forecast`. Without it, and for a density of the user's own, the draws are in `values` alone,
+    by name as they were written.
 
     **Raises:** `InputError` where the file cannot be read, was not written by `save`, or is of another posterior.
     """
@@ -180,7 +185,8 @@ def load_posterior(path: str | Path, estimate: Estimate | None = None) -> Poster
         data = arviz().from_netcdf(str(path))
         stats, attributes = data.sample_stats, data.posterior.attrs
         arrays = {name: jnp.asarray(stats[name].values) for name in stats.data_vars}
-        names, sampler = [str(name) for name in data.posterior.data_vars], str(attributes["sampler"])
+        values = {str(name): jnp.asarray(data.posterior[name].values) for name in data.posterior.data_vars}
+        sampler = str(attributes["sampler"])
         numbers = {name: attributes[name].item() for name in _NUMBERS if name in attributes}
         remarks = tuple(str(attributes["remarks"]).splitlines())
         drawn = Drawn(
@@ -194,17 +200,20 @@ def load_posterior(path: str | Path, estimate: Estimate | None = None) -> Poster
         )
     except (OSError, KeyError, AttributeError, ValueError, TypeError) as error:
         raise InputError(f"`{path}` is not a posterior that can be read: {error}.") from error
-    _refuse_other(path, estimate, names, drawn)
+    if estimate is None:
+        return Posterior(None, values, drawn, diagnose_draws(values, drawn), sampler)
+    _refuse_other(path, estimate, list(values), drawn)
     return posterior_of(estimate, drawn, sampler)
 
 
-def _refuse_other(path: Any, estimate: Estimate | None, names: list[str], drawn: Drawn) -> None:
+def _refuse_other(path: Any, estimate: Estimate, names: list[str], drawn: Drawn) -> None:
     """Refuse draws that are not of the estimate's posterior."""
-    known = ["x"] if estimate is None else list(named_parameters(estimate.model))
+    known = list(named_parameters(estimate.model))
     if sorted(names) != sorted(known):
-        raise InputError(f"`{path}` holds draws of {', '.join(names)}, but what learns is: {', '.join(known)}.")
-    if estimate is None:
-        return
+        raise InputError(
+            f"`{path}` holds draws of {', '.join(names)}, but what learns is: {', '.join(known)}; give the estimate "
+            "that they were drawn around, or none for the draws alone."
+        )
     size, given = flatten(estimate.model)[0].size, drawn.free.shape[-1]
     if size != given:
         raise InputError(f"`{path}` holds draws of {given} numbers, but the model learns {size}.")

@@ -102,7 +102,10 @@ def posterior_forecast(
     """
     estimate = posterior.estimate
     if estimate is None:
-        raise InputError("This posterior is of a density without a model: there is nothing to push forward.")
+        raise InputError(
+            "This posterior has no model to push forward: it is of a density of your own, or was loaded without its "
+            "estimate; give `load_posterior(path, estimate)`."
+        )
     choice = Choice(process_noise, measurement_noise, in_sample)
     task = task_of(estimate, choice, recording, times, until, substeps, inputs)
     count = min(_DRAWS, len(posterior.draws())) if draws is None else draws
