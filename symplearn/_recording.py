@@ -43,11 +43,12 @@ class Recording:
         )
 
 
-def read_recordings(simulation: SimulationFile, paths: Sequence[str | Path]) -> list[Recording]:
-    """The recordings of the CSV files `paths`: files in the order given, then groups in the order met.
+def read_recordings(simulation: SimulationFile, paths: str | Path | Sequence[str | Path]) -> list[Recording]:
+    """The recordings of the CSV files `paths`, or of one: files in the order given, then groups in the order met.
 
     **Raises** `InputError` in one sentence naming file, line and column.
     """
+    paths = [paths] if isinstance(paths, str | Path) else paths
     if not paths:
         raise InputError(f"{simulation.name}: no recording was given; give at least one CSV file")
     parts = [part for path in paths for part in _parts(simulation, path)]

@@ -34,6 +34,15 @@ def read(tmp_path, text, recording="", observe='a = "q"', name="r.csv"):
     return read_recordings(simulation(recording, observe), [path])
 
 
+def test_one_path_needs_no_list(tmp_path):
+    """One file may be given by its path alone, in words or as a `Path`: no string is taken for its characters."""
+    path = tmp_path / "r.csv"
+    path.write_text("t,a\n" + "".join(f"{t},{t % 3}\n" for t in range(6)))
+    for one in (path, str(path), [path], (str(path),)):
+        (recording,) = read_recordings(simulation(), one)
+        assert recording.times.tolist() == [0, 1, 2, 3, 4, 5]
+
+
 PLAIN = "t,a\n0,1\n1,2\n2,\n3,NaN\n4,-5e-1\n"
 TIMES, READINGS = [0, 1, 2, 3, 4], [1, 2, np.nan, np.nan, -0.5]
 
