@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -179,3 +181,14 @@ def test_quick_surfaces_have_the_specifications_minima(tmp_path):
             if "specification" in found["range"]:
                 assert round(found["range"]["first"]) == found["range"]["specification"]
     assert (tmp_path / "objective_surfaces.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_experiments_are_listed():
+    """`python -m experiments` names every experiment that is a command, with what it is about."""
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments"], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True
+    )
+    listed = dict(line.split(maxsplit=3)[2:] for line in done.stdout.splitlines()[:-1])
+    files = [path.stem for path in (ROOT / "experiments").glob("[!_]*.py")]
+    assert sorted(listed) == sorted(f"experiments.{name}" for name in files)
+    assert all(about.endswith(".") for about in listed.values())
