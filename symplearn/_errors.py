@@ -26,8 +26,8 @@ def shown(text: object, limit: int = 60) -> str:
     return f"`{printable(text[:limit])}...`" if len(text) > limit else f"`{printable(text)}`"
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """`did you mean ...?`, with the known name nearest to `name`, or the known names where none is near."""
+def nearest(name: str, known: Iterable[str], most: int = 12) -> str:
+    """`did you mean ...?`, with the known name nearest to `name`, or the first known names where none is near."""
     known = list(known)
     if not known:
         return "there is none to choose from"
@@ -35,4 +35,4 @@ def nearest(name: str, known: Iterable[str]) -> str:
     found = difflib.get_close_matches(str(name)[:80], [k[:80] for k in known], n=1, cutoff=0.55)
     if found:
         return f"did you mean {shown(found[0])}?"
-    return "known are " + ", ".join(shown(k, 40) for k in known[:12]) + (", ..." if len(known) > 12 else "")
+    return "known are " + ", ".join(shown(k, 40) for k in known[:most]) + (", ..." if len(known) > most else "")

@@ -45,7 +45,9 @@ class TermReader:
         if effect is None:
             raise InputError(f"{where} effect: missing; name one of the effects, such as `viscous_damping`")
         if not isinstance(effect, str) or effect not in VOCABULARY:
-            raise InputError(f"{where} effect: unknown effect {shown(effect)}; {nearest(str(effect), VOCABULARY)}")
+            raise InputError(
+                f"{where} effect: unknown effect {shown(effect)}; {nearest(str(effect), VOCABULARY, len(VOCABULARY))}"
+            )
         return VOCABULARY[effect]
 
     def check_keys(self, data: Mapping[str, Any], word: Word, where: str) -> None:

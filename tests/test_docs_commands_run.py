@@ -62,6 +62,18 @@ def test_snippet_of_the_readme(checkout):
     assert "mismatch" in done.stdout and 'effect = "viscous_damping"' in done.stdout
 
 
+@pytest.mark.slow
+def test_python_of_the_page(checkout):
+    """The page's Python, with `Options`, finds among the effects that it names what the demo left out."""
+    folder, places = checkout
+    (snippet,) = blocks(PAGE, "python")
+    done = subprocess.run(
+        [sys.executable, "-c", snippet], cwd=folder, env=places, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("mismatch ")
+
+
 def test_page_shows_the_file_that_ships():
     """The simulation file on the page is the one inside the package."""
     (shown,) = blocks(PAGE, "toml")

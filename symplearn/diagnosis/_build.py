@@ -1,6 +1,6 @@
 """From a simulation file and its recordings to the problem that is fitted."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,7 @@ import sympy
 import integrators as ig
 
 from .._augmented import Equations, equations
-from .._effects import DELAY, EFFECTS, ERROR, HIDDEN, NOISE, OUTLIERS, Candidate, Effect
+from .._effects import DELAY, EFFECTS, ERROR, HIDDEN, NOISE, OUTLIERS, UNNAMED, Candidate, Effect
 from .._errors import InputError, nearest, shown
 from .._expression import symbol
 from .._recording import Recording
@@ -37,7 +37,10 @@ _HALVINGS = 6  # the first of them may only keep a stiff motion from being throw
 
 @dataclass(frozen=True)
 class Restriction:
-    """Which effects are searched: all, or the named ones; of the sensor, of the dynamics, or both."""
+    """Which effects are searched: all, or the named ones; of the sensor, of the dynamics, or both.
+
+    `restriction_of` makes it, and checks it.
+    """
 
     effects: tuple[str, ...] | None = None
     sensor: bool = True
@@ -220,19 +223,33 @@ def _calibrated(free: Sequence[tuple[str, int, Quantity, np.ndarray]], parameter
     )
 
 
-def restriction_of(effects: str | None, sensor_only: bool, dynamics_only: bool) -> Restriction:
-    """The restriction that the command line asks for. `InputError` for an unknown effect or a contradiction."""
+def restriction_of(
+    effects: str | Iterable[str] | None = None, sensor_only: bool = False, dynamics_only: bool = False
+) -> Restriction:
+    """Which effects to search: `effects` by name, in a list or separated by commas, or all.
+
+    **Raises:** `InputError` for an unknown effect or a contradiction.
+    """
     if sensor_only and dynamics_only:
         raise InputError("--sensor-only and --dynamics-only exclude each other; give one of them")
-    names = None
-    if effects is not None:
-        names = tuple(name.strip() for name in effects.split(",") if name.strip())
-        for name in names:
-            if name not in EFFECTS:
-                raise InputError(f"--effects: unknown effect {shown(name)}; {nearest(name, EFFECTS)}")
-        if not names:
-            raise InputError(f"--effects: names no effect; give some of {', '.join(EFFECTS)}, separated by commas")
+    names = None if effects is None else _names(effects)
     return Restriction(names, sensor=not dynamics_only, dynamics=not sensor_only)
+
+
+def _names(effects: str | Iterable[str]) -> tuple[str, ...]:
+    given = effects.split(",") if isinstance(effects, str) else effects
+    names = tuple(name.strip() for name in map(str, given) if name.strip())
+    for name in names:
+        if name == UNNAMED.name:
+            raise InputError(
+                f"--effects: {shown(name)} is not searched by name; leave --effects out, and it is tried where no "
+                "named effect explains the recording"
+            )
+        if name not in EFFECTS:
+            raise InputError(f"--effects: unknown effect {shown(name)}; {nearest(name, EFFECTS, len(EFFECTS))}")
+    if not names:
+        raise InputError(f"--effects: names no effect; give some of {', '.join(EFFECTS)}, separated by commas")
+    return names
 
 
 def rows_fitted(rows: Sequence[Rows]) -> list[int]:

@@ -2,9 +2,11 @@
 
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
+from .._errors import InputError, shown
 from .._recording import Recording
 from .._simulation_records import SimulationFile
 from .._small_arrays import on_one_thread
@@ -22,10 +24,24 @@ def diagnose(file: SimulationFile, recordings: Sequence[Recording], options: Opt
     """Locate what differs between a simulation and its recordings, name what was left out, and show the fit without
     and with it.
 
-    `InputError` where simulation and recordings do not fit together.
+    `InputError` where something else is given, as a path, or simulation and recordings do not fit together.
     """
+    _refuse_paths(file, recordings, options)
     with np.errstate(all="ignore"):  # what is not finite is told in the answer
         return _diagnosed(file, recordings, options)
+
+
+def _refuse_paths(file: Any, recordings: Any, options: Any) -> None:
+    """Refuse what only the command line takes: names of files, and options one by one."""
+    if not isinstance(file, SimulationFile):
+        raise InputError(f"`diagnose` needs what `read_simulation` gives, not {shown(file)}; read the file first")
+    is_list = isinstance(recordings, list | tuple)
+    wrong = [one for one in recordings if not isinstance(one, Recording)] if is_list else [recordings]
+    if wrong or not recordings:
+        other = shown(wrong[0]) if wrong else "an empty list"
+        raise InputError(f"`diagnose` needs the list that `read_recordings` gives, not {other}; read them first")
+    if not isinstance(options, Options):
+        raise InputError(f"`diagnose` needs `Options(...)`, not {shown(options)}; name in it what is to be changed")
 
 
 def _diagnosed(file: SimulationFile, recordings: Sequence[Recording], options: Options) -> Diagnosis:
