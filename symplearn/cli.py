@@ -1,12 +1,13 @@
 """The `symplearn` command."""
 
+import contextlib
+import math
 import os
 import signal
 import sys
-import time
-from importlib import resources
+from collections.abc import Iterator
+from importlib import metadata, resources
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -15,6 +16,7 @@ from typer.exceptions import TyperException
 
 from ._errors import InputError, printable
 from ._private_cache import prepare
+from ._progress import STOPPED, Progress, Terminated, interrupt
 
 app = typer.Typer(
     name="symplearn",
@@ -23,8 +25,22 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _CORES = os.cpu_count() or 1
-_STOPPED = 130  # by Ctrl-C, as a shell says it
 _Positive = Annotated[int, typer.Option(min=1, help="Threads; the answer does not depend on it.")]
+
+
+def _tell_version(asked: bool) -> bool:
+    if asked:
+        print(f"symplearn {metadata.version('symplearn')}")
+        raise typer.Exit
+    return asked
+
+
+@app.callback()
+def _symplearn(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Print the version and leave.")
+    ] = False,
+) -> None: ...
 
 
 @app.command()
@@ -50,20 +66,18 @@ def diagnose(
 ) -> None:
     """Locate what differs, name what was left out, and show the fit without and with it."""
     _check(holdout, time_limit)
-    if forecast_step is not None and forecast_until is None:
-        raise InputError("--forecast-step: needs --forecast-until; give the time to forecast to")
+    _check_forecast(forecast_until, forecast_step)
     prepare(cache)
     from ._recording import read_recordings
     from ._simulation_file import read_simulation
     from .diagnosis import Options
     from .diagnosis import diagnose as run
-    from .report import prepare_directory, summary, write_outputs
+    from .report import summary, write_outputs
 
     restriction = _restriction(effects, sensor_only, dynamics_only)
     file = read_simulation(simulation)
     read = read_recordings(file, recordings)
-    folder = prepare_directory(out)
-    with _Progress() as progress:
+    with Progress() as progress, _folder(out) as folder:
         found = run(
             file,
             read,
@@ -117,7 +131,7 @@ def diagnose_each(
     settings = each.Settings(holdout, seed, _restriction(effects, sensor_only, dynamics_only), threads, limit, cache)
     read_simulation(simulation)  # for all of them, what is wrong with it is said once
     console, failed = Console(), 0
-    with place(scheduler, lambda line: print(line, file=sys.stderr)) as workers, _Progress() as progress:
+    with place(scheduler, lambda line: print(line, file=sys.stderr)) as workers, Progress() as progress:
         for one in each.diagnose_each(workers, simulation, recordings, out, settings):
             failed += one.failure is not None
             said = "kept from before" if one.kept else one.verdict or f"failed: {one.failure}"
@@ -132,6 +146,15 @@ def _check(holdout: float, time_limit: float | None) -> None:
         raise InputError(f"--holdout: is {holdout}; give a share from 0 up to, but not including, 1")
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"--time-limit: is {time_limit}; give a positive number of seconds")
+
+
+def _check_forecast(until: float | None, step: float | None) -> None:
+    if until is not None and not math.isfinite(until):
+        raise InputError(f"--forecast-until: is {until}; give the time to forecast to")
+    if step is not None and not (math.isfinite(step) and step > 0):
+        raise InputError(f"--forecast-step: is {step}; give a positive number in the recording's unit of time")
+    if step is not None and until is None:
+        raise InputError("--forecast-step: needs --forecast-until; give the time to forecast to")
 
 
 def _restriction(effects: str | None, sensor_only: bool, dynamics_only: bool) -> Any:
@@ -155,45 +178,31 @@ def demo(
         diagnose(folder / "simulation.toml", [folder / "recording.csv"], out=out)
 
 
-class _Progress:
-    """What is being done, on stderr, from the second second on."""
+@contextlib.contextmanager
+def _folder(out: Path) -> Iterator[Path]:
+    """The output folder. Where it was made for a report that then is not written, it is taken away again."""
+    from .report import prepare_directory
 
-    def __init__(self) -> None:
-        self._console = Console(stderr=True)
-        self._begin = time.monotonic()
-        self._status = self._console.status("", spinner="line") if self._console.is_terminal else None
-        self._stopped = False
-
-    def __enter__(self) -> "_Progress":
-        self._handler = signal.signal(signal.SIGINT, self._stop)
-        if self._status:
-            self._status.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        signal.signal(signal.SIGINT, self._handler)
-        if self._status:
-            self._status.stop()
-
-    def _stop(self, number: int, frame: Any) -> NoReturn:
-        self._stopped = True
-        raise KeyboardInterrupt
-
-    def say(self, message: str) -> None:
-        """Tell what comes next; a Ctrl-C that a destructor or a callback swallowed is noticed here."""
-        if self._stopped:
-            raise KeyboardInterrupt
-        passed = time.monotonic() - self._begin
-        if self._status:
-            self._status.update(f"{passed:4.0f} s  {message}")
-        elif passed > 1.0:
-            self._console.print(f"{passed:6.1f} s  {message}", markup=False, highlight=False)
+    made = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
+    try:
+        yield prepare_directory(out)
+    except BaseException:
+        for folder in made:
+            with contextlib.suppress(OSError, ValueError):  # what is not empty stays
+                folder.rmdir()
+        raise
 
 
 def main() -> None:
     """Run the command; wrong input is one line on stderr and exit code 2, a failure one line and exit code 1."""
+    handler = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        _main()
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+
+
+def _main() -> None:
     try:
         code = app(sys.argv[1:] or ["--help"], prog_name="symplearn", standalone_mode=False)
     except InputError as error:
@@ -201,18 +210,22 @@ def main() -> None:
     except TyperException as error:
         _leave(2, _usage_sentence(error))
     except (KeyboardInterrupt, typer.Abort):
-        code = _STOPPED
+        _leave_stopped(signal.SIGINT)
+    except Terminated:
+        _leave_stopped(signal.SIGTERM)
     except Exception as error:
         if os.environ.get("SYMPLEARN_TRACEBACK"):
             raise
         _leave(1, f"failed: {type(error).__name__}: {printable(str(error))[:500]}")
-    if code == _STOPPED:
-        each = sys.argv[1:2] == ["diagnose-each"]
-        _leave(
-            _STOPPED,
-            f"stopped; {'what is done is kept, and the same command goes on' if each else 'nothing was written'}",
-        )
+    if code == STOPPED + signal.SIGINT:  # typer's own word for a Ctrl-C that it has caught
+        _leave_stopped(signal.SIGINT)
     sys.exit(code)
+
+
+def _leave_stopped(number: int) -> NoReturn:
+    each = sys.argv[1:2] == ["diagnose-each"]
+    left = "what is done is kept, and the same command goes on" if each else "nothing was written"
+    _leave(STOPPED + number, f"stopped; {left}")
 
 
 def _leave(code: int, sentence: str) -> NoReturn:

@@ -9,7 +9,8 @@ import pytest
 from command_line_cases import COMMAND, ONE_EFFECT, environment, write_case
 from contract import check_document, strict_json
 
-from symplearn.cli import _Progress
+from symplearn._progress import Progress
+from symplearn.cli import _folder
 from symplearn.report import _directory
 
 FILES = {"augmented.toml", "report.html", "diagnosis.json"}
@@ -25,16 +26,16 @@ def started(folder, out):
 
 @pytest.mark.parametrize("blow", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])
 def test_stopped_in_the_middle(blow, tmp_path):
-    """Stopped while it searches, it leaves an empty folder; Ctrl-C is answered in one line and code 130."""
+    """Stopped while it searches, it leaves no folder and says so, with code 130 or 143; killed, an empty folder."""
     run = started(tmp_path, tmp_path / "out")
     run.stderr.readline()
     run.send_signal(blow)
     rest = run.communicate(timeout=60)[1]
-    assert not list((tmp_path / "out").iterdir())
-    if blow == signal.SIGINT:
-        assert run.returncode == 130 and rest.endswith("symplearn: stopped; nothing was written\n")
+    if blow == signal.SIGKILL:
+        assert run.returncode == -blow and not list((tmp_path / "out").iterdir())
     else:
-        assert run.returncode == -blow
+        assert run.returncode == 128 + blow and rest.endswith("symplearn: stopped; nothing was written\n")
+        assert not (tmp_path / "out").exists()
     assert "Traceback" not in rest
 
 
@@ -76,12 +77,27 @@ def test_full_disk_leaves_the_old_answer(tmp_path, monkeypatch):
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == old
 
 
+def test_a_folder_that_was_there_stays(tmp_path):
+    """A run that is stopped takes away only folders that it has made, and no folder that something lies in."""
+    (tmp_path / "mine").mkdir()
+    run = started(tmp_path, tmp_path / "mine")
+    run.stderr.readline()
+    run.send_signal(signal.SIGTERM)
+    run.communicate(timeout=60)
+    assert run.returncode == 143 and not list((tmp_path / "mine").iterdir())
+    with pytest.raises(RuntimeError), _folder(tmp_path / "new" / "deep"):
+        (tmp_path / "new" / "note").touch()
+        raise RuntimeError
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["note"]
+
+
 def test_a_stop_that_was_swallowed_is_heard_at_the_next_step():
     """Python drops a Ctrl-C that arrives inside a destructor; the run then stops at its next progress message."""
-    before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), _Progress() as progress:
-        progress.say("searching")
-        with contextlib.suppress(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-        progress.say("writing the report")
-    assert signal.getsignal(signal.SIGINT) is before
+    for number, told in ((signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)):
+        before = signal.getsignal(number)
+        with pytest.raises(told), Progress() as progress:
+            progress.say("searching")
+            with contextlib.suppress(told):
+                signal.raise_signal(number)
+            progress.say("writing the report")
+        assert signal.getsignal(number) is before

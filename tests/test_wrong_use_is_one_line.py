@@ -1,7 +1,11 @@
 """Whatever is wrong with a command line, the command says so in one line on stderr and leaves with code 2."""
 
+import subprocess
+import sys
+from importlib.metadata import version
+
 import pytest
-from command_line_cases import Ran, run_apart, run_here, write_case
+from command_line_cases import Ran, environment, run_apart, run_here, write_case
 
 
 @pytest.fixture
@@ -33,7 +37,11 @@ WRONG = {
     "empty effects": (("--effects", ","), "--effects"),
     "step without end": (("--forecast-step", "0.1"), "--forecast-until"),
     "step of zero": (("--forecast-until", "30", "--forecast-step", "0"), "--forecast-step"),
-    "forecast of the past": (("--forecast-until", "3"), "--forecast-until"),
+    "forecast of the past": (
+        ("--forecast-until", "3"),
+        "is 3, and the last observed time is 16; give a time at least 0.2",
+    ),
+    "force without a name": (("--effects", "unnamed_force"), "not searched by name"),
     "endless forecast": (("--forecast-until", "inf"), "--forecast-until"),
     "restrictions that leave nothing": (("--sensor-only", "--effects", "viscous_damping"), "--sensor-only"),
     "seed beyond 64 bits": (("--seed", "9" * 30), "--seed"),
@@ -45,7 +53,7 @@ def test_wrong_options(options, said, command, tmp_path):
     """A wrong option is named with what is wrong about it, before any work."""
     ran = command("diagnose", *write_case(tmp_path), "--out", tmp_path / "out", *options)
     assert said in one_line(ran)
-    assert not (tmp_path / "out" / "diagnosis.json").exists()
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("arguments", [("diagnose",), ("diagnose", "only.toml"), ("diagnosis",), ("--fast",)])
@@ -87,6 +95,25 @@ def test_no_arguments_show_the_help(command):
     """The bare command says what there is."""
     ran = command()
     assert ran.code == 0 and "diagnose" in ran.out and "demo" in ran.out
+
+
+def test_the_version_is_told(command):
+    """`--version` prints the version that `diagnosis.json` has, and does nothing else."""
+    ran = command("--version")
+    assert ran.code == 0 and ran.out == f"symplearn {version('symplearn')}\n" and ran.err == ""
+
+
+def test_the_package_is_the_command(tmp_path):
+    """`python -m symplearn` is the command, for an environment whose programs are not on the path."""
+    done = subprocess.run(
+        [sys.executable, "-m", "symplearn", "diagnose", "none.toml", "none.csv"],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 2 and done.stderr.startswith("symplearn: none.toml")
 
 
 def test_a_failure_is_one_line_and_code_1(command, tmp_path, monkeypatch):
