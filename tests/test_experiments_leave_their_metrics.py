@@ -4,6 +4,7 @@ import json
 import math
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from experiments import _command as command
 from experiments import logistic_map as logistic
 from experiments import objective_surfaces as surfaces
 from experiments import sinusoid
+
+ROOT = Path(__file__).parents[1]
 
 
 def ran(script, folder, *options):
