@@ -14,6 +14,7 @@ from symplearn.diagnosis._course import courses
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._stochastic import free_run
 from symplearn.diagnosis._trajectory import Stepper
+from symplearn.diagnosis._warnings import doubled
 
 TIMES = np.linspace(2.0, 8.0, 121)
 START = np.array([0.7, -0.4, 0.3, 0.5])
@@ -248,3 +249,18 @@ def test_a_known_noise_is_widened():
     partial = parse_simulation(f"{text}{term}\nrecordings = [1]", "known.toml")
     with pytest.raises(InputError, match=r"known\.toml: \[\[terms\]\] 1"):
         augmented_equations(partial, 2.0)
+
+
+def test_a_term_that_stands_twice_is_told():
+    """The same law of the same target twice in a recording is a warning; two forcings, or two runs' terms, are none."""
+    damping = 'effect = "viscous_damping"\ntarget = "y"\nc = 0.3\n'
+    forcing = 'effect = "periodic_forcing"\ntarget = "y"\na = 0.3\nomega = 2.0\nphi = 0.0\n'
+
+    def told(*terms):
+        return doubled(parse_simulation(FILE + "[[terms]]\n".join(terms), "known.toml"))
+
+    assert told(damping, forcing, damping) == ["[[terms]] has viscous_damping of y more than once: all of them act"]
+    assert len(told(damping + "recordings = [1, 2]\n", damping + "recordings = [2]\n")) == 1
+    assert len(told(damping, damping, damping)) == 1
+    assert told(damping, damping.replace('"y"', '"x"'), forcing, forcing.replace("2.0", "3.0")) == []
+    assert told(damping + "recordings = [1]\n", damping + "recordings = [2]\n") == []

@@ -35,7 +35,7 @@ from ._record import Diagnosis, Forecast, Series
 from ._trajectory import Stepper
 from ._units import coefficient_units, time_unit
 from ._unnamed import written
-from ._warnings import warnings
+from ._warnings import doubled, warnings
 from ._weighed import Estimate, coloured_inflation
 from ._words import equation_lines, finding_sentence, next_measurement
 
@@ -173,7 +173,8 @@ class Answer:
             },
             "fit": {"before": before, "after": after},
             "next_measurement": self._next(),
-            "warnings": warnings(
+            "warnings": doubled(self.file)
+            + warnings(
                 self.problem,
                 self.recordings,
                 self.found,

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .._recording import Recording
+from .._simulation_records import SimulationFile
 from ._found import Found
 from ._locate import spell_windows
 from ._outlook import Outlook
@@ -99,6 +100,21 @@ def _same(recordings: Sequence[Recording]) -> list[tuple[int, int]]:
         for a, b in itertools.combinations(recordings, 2)
         if np.array_equal(a.times, b.times) and np.array_equal(a.readings, b.readings, equal_nan=True)
     ]
+
+
+def doubled(file: SimulationFile) -> list[str]:
+    """Which known terms of one coefficient are there twice in a recording: their sum is one of the same law.
+
+    Forcings and impulses of several frequencies and times are not; they may well be several.
+    """
+    out = []
+    for k, one in enumerate(file.terms):
+        for other in file.terms[:k]:
+            same = (one.effect, one.target) == (other.effect, other.target) and len(one.coefficients) == 1
+            anywhere = one.recordings is None or other.recordings is None
+            if same and (anywhere or {*(one.recordings or ())} & {*(other.recordings or ())}):
+                out.append(f"[[terms]] has {one.effect} of {', '.join(one.target)} more than once: all of them act")
+    return list(dict.fromkeys(out))
 
 
 def _when(problem: Problem, recordings: Sequence[Recording], best: Estimate) -> str:
