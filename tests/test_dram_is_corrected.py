@@ -61,7 +61,7 @@ def test_wrong_numbers_are_one_sentence():
     """Blocks that overlap, a patience of nothing and a shrinkage of 1 are refused."""
     with pytest.raises(InputError, match="disjoint places in a vector of 2"):
         dram(correlated, np.eye(2), ((0,), (0, 1)))
-    with pytest.raises(InputError, match="`patience` of 1 sweep or more"):
+    with pytest.raises(InputError, match="`patience` of at least 1"):
         dram(correlated, np.eye(2), patience=0)
     with pytest.raises(InputError, match="`shrinkage` between 0 and 1"):
         dram(correlated, np.eye(2), shrinkage=1.0)

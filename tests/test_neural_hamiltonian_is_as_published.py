@@ -90,5 +90,5 @@ def test_tao_steps_of_a_network_are_symplectic():
 @pytest.mark.parametrize("sizes", [{"dim": 0}, {"dim": 1, "width": 0}, {"dim": 1, "depth": 1}])
 def test_sizes_that_make_no_network_are_refused(sizes):
     """A size that makes no network is named in one sentence."""
-    with pytest.raises(InputError, match="`NSSNN` needs dim and width"):
+    with pytest.raises(InputError, match="`NSSNN` needs `(dim|width|depth)` of at least"):
         NSSNN(**sizes, key=jax.random.key(0))
