@@ -8,9 +8,6 @@ import numpy as np
 from ._errors import InputError, shown
 from ._simulation_records import SimulationFile
 
-# Squares of readings, and sums of them, stay numbers below this.
-_LARGEST = 1e100
-
 
 @runtime_checkable
 class _Rows(Protocol):
@@ -18,8 +15,6 @@ class _Rows(Protocol):
 
     @property
     def name(self) -> str: ...
-    @property
-    def columns(self) -> Sequence[str]: ...
     @property
     def readings(self) -> np.ndarray: ...
 
@@ -45,7 +40,6 @@ def check_recordings(simulation: SimulationFile, recordings: Sequence[_Rows]) ->
     """There is enough in the recordings to learn from."""
     _check_numbers(simulation, len(recordings))
     _check_missing(simulation, recordings)
-    _check_sizes(recordings)
     _check_rows(simulation, recordings)
     if not any(_moves(r.readings) for r in recordings):
         told = ", ".join(map(shown, simulation.recording.observe))
@@ -86,17 +80,6 @@ def _check_missing(simulation: SimulationFile, recordings: Sequence[_Rows]) -> N
             raise InputError(
                 f"{_names(recordings)}, column {shown(column)}: all readings are missing; "
                 "give readings or take it out of [recording.observe]"
-            )
-
-
-def _check_sizes(recordings: Sequence[_Rows]) -> None:
-    """No reading is so large that its square is no number."""
-    for r in recordings:
-        # NaN, where nothing was read, is not larger than anything.
-        for row, column in np.argwhere(np.abs(r.readings) > _LARGEST)[:1]:
-            raise InputError(
-                f"{r.name}: a reading of {shown(r.columns[column])} is {r.readings[row, column]:g}, too large to "
-                f"compute with; leave the cell empty, or give the column in a unit in which it is below {_LARGEST:g}"
             )
 
 

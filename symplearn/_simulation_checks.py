@@ -36,7 +36,7 @@ def checked_simulation(data: Mapping[str, Any], file: str) -> SimulationFile:
         initial=_initial(table, states, file),
         forces=_forces(table, names, file),
         recording=_recording(recording, names, states, file),
-        units=_units(table, names, file),
+        units=dict(table.units),
         integrator=_integrator(table.integrator, file),
         terms=TermReader(table, names, file).terms(),
     )
@@ -171,19 +171,6 @@ def _noise(table: RecordingTable, file: str) -> dict[str, float]:
         if not sd > 0:
             raise InputError(f"{where}: {sd:g} is not a standard deviation; give a number above zero")
     return dict(table.noise)
-
-
-def _units(table: SimulationTable, names: Collection[str], file: str) -> dict[str, str]:
-    """Units of what the file names, of the energy H and of t; of anything else they are a name mistyped."""
-    recording, group = table.recording, table.recording.group
-    columns = [*recording.observe, recording.time, *([group] if isinstance(group, str) else group or [])]
-    known = list(dict.fromkeys([*columns, *recording.where, *names, "t", "H"]))
-    for name in table.units:
-        if name not in known:
-            raise InputError(
-                f"{file}, {place(['units', name])}: no column, state or parameter; {nearest(name, known, len(known))}"
-            )
-    return dict(table.units)
 
 
 def _integrator(table: IntegratorTable, file: str) -> IntegratorSection:

@@ -5,8 +5,6 @@ import numpy as np
 import pytest
 
 from symplearn import InputError
-from symplearn._recording import Recording
-from symplearn._recording_checks import check_recordings
 from symplearn.diagnosis import Options, Restriction, diagnose
 
 TIMES = np.linspace(0.0, 20.0, 60)
@@ -79,7 +77,7 @@ def test_effects_that_can_be_nowhere_are_refused():
 @pytest.mark.parametrize("reading", [1e300, -1e101])
 def test_a_reading_too_large_to_compute_with_is_refused(reading):
     """Its square is no number; column and reading are told. A recording without readings beside it is none of that."""
-    one = Recording(1, "a.csv", ("y",), TIMES, np.where(np.arange(60) == 7, reading, np.cos(TIMES))[:, None], TIMES)
-    none = Recording(2, "b.csv", ("y",), TIMES, np.full((60, 1), np.nan), TIMES)
-    with pytest.raises(InputError, match=r"a\.csv: a reading of `y` is -?1e\+[13]0[01], too large"):
-        check_recordings(swing(), [none, one])
+    y = np.where(np.arange(60) == 7, reading, np.cos(TIMES))
+    none = cases.recorded(TIMES, np.full(60, np.nan), number=2)
+    with pytest.raises(InputError, match=r"column `y0`: -?1e\+[13]0[01] is too large"):
+        diagnose(swing(), [none, cases.recorded(TIMES, y)])

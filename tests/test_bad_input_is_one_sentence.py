@@ -137,8 +137,6 @@ TOML = {
     "integrator": changed('name = "auto"', 'name = "leapfrg"'),
     "step zero": changed("step = 0.01", "step = 0"),
     "step text": changed("step = 0.01", 'step = "small"'),
-    "unit of nothing": GOOD.replace("[integrator]", '[units]\nangel = "rad"\n[integrator]'),
-    "unit of foo": GOOD.replace("[integrator]", '[units]\nt_s = "s"\nfoo = "m"\n[integrator]'),
     "units a number": GOOD.replace("[integrator]", "[units]\nt = 1\n[integrator]"),
     "title a number": changed('title = "Pendulum"', "title = 3"),
     "terms a table": GOOD.replace("[[terms]]", "[terms]"),
@@ -205,8 +203,6 @@ def test_wrong_simulation_files(text, tmp_path):
         ("unknown effect", r"\[\[terms\]\] 1 effect: unknown effect `viscous_dampng`; did you mean"),
         ("integrator", r"\[integrator\] name: unknown word `leapfrg`; did you mean `leapfrog`"),
         ("force on coordinate", r"\[forces\] theta: a force changes a momentum.*use `p_theta`"),
-        ("unit of nothing", r"\[units\] angel: no column, state or parameter; did you mean `angle`"),
-        ("unit of foo", r"\[units\] foo: no column.*; known are `angle`, `t_s`, `theta`, .*`u`, `t`, `H`"),
         ("no time", r"\[recording\] time: missing; name the column of times"),
     ],
 )

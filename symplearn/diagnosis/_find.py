@@ -21,7 +21,7 @@ from ._search import Search
 from ._start import first_fits, priors_without_effects
 from ._trajectory import Stepper
 from ._unnamed import proposals
-from ._usable import check_fitted, check_motion, check_searched, check_steps
+from ._usable import check_fitted, check_motion, check_readings, check_searched, check_steps
 from ._weighed import Estimate
 
 # Third differences show the noise and some of the motion: the share of them that counts as noise at least.
@@ -37,6 +37,7 @@ def searched(
 
     `InputError` where there is nothing to fit, to search or to step.
     """
+    check_readings(recordings)
     check_steps(file, recordings)
     first, middle = float(recordings[0].times[0]), float(np.mean(recordings[0].times[[0, -1]]))
     built = augmented_equations(file, first, options.restriction, middle)

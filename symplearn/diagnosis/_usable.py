@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .._errors import InputError
+from .._errors import InputError, shown
 from .._recording import Recording
 from .._simulation_records import SimulationFile
 from ._along import along, force, readings, velocity
@@ -12,6 +12,8 @@ from ._build import Restriction
 from ._problem import Problem
 from ._start import priors_without_effects, scattered
 
+# Squares of readings, and sums of them, stay numbers below this.
+_LARGEST = 1e100
 # Substeps that can be laid out in all, some hundred megabytes of times.
 _STEPS = 2e7
 # Starts at which the equations of motion are looked at, a few at a time.
@@ -21,6 +23,18 @@ _SAID = {
     "forces that follow from the Hamiltonian": force,
     "readings": readings,
 }
+
+
+def check_readings(recordings: Sequence[Recording]) -> None:
+    """No reading is so large that its square is no number. `InputError` otherwise."""
+    for r in recordings:
+        # NaN, where nothing was read, is not larger than anything.
+        for row, column in np.argwhere(np.abs(r.readings) > _LARGEST)[:1]:
+            raise InputError(
+                f"{r.name}, line {r.lines[row]}, column {shown(r.columns[column])}: {r.readings[row, column]:g} is too "
+                f"large to compute with; leave the cell empty, or give the column in a unit in which it is below "
+                f"{_LARGEST:g}"
+            )
 
 
 def check_steps(file: SimulationFile, recordings: Sequence[Recording]) -> None:
