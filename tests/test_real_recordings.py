@@ -16,7 +16,7 @@ def dissipation(document):
 
 
 def test_pendulum_with_two_balls():
-    """Viscous damping within 25 % of the fitted 0.167/s times J; held out as good as SciPy's best law of the vocabulary.
+    """Viscous damping within 25 % of the fitted 0.167/s times J; held out as good as SciPy's best law of it.
 
     Beside it stands a modulation at twice the swing's frequency, which nobody knows of. It is not forbidden here as it
     was: by SciPy's fits to three quarters of the rows it leaves 0.103 degrees of them and 0.18 of the rest, where all
