@@ -1,11 +1,14 @@
 """Where nothing can be fitted, searched, stepped or read, that is said in one sentence before any work."""
 
+from dataclasses import replace
+
 import engine_cases as cases
 import numpy as np
 import pytest
 
 from symplearn import InputError
 from symplearn.diagnosis import Options, Restriction, diagnose
+from symplearn.diagnosis._usable import check_searched
 
 TIMES = np.linspace(0.0, 20.0, 60)
 
@@ -72,6 +75,14 @@ def test_effects_that_can_be_nowhere_are_refused():
     """Of one coordinate none can be coupled to another."""
     said = refusal(swing(), read(), Options(restriction=Restriction(("gyroscopic_coupling",))))
     assert "gyroscopic_coupling" in said
+
+
+def test_an_expression_alone_may_be_asked_for():
+    """No effect with a name is searched then, which is no reason to refuse."""
+    p = replace(cases.problem(swing(), [read()], 0.05), searched=())
+    check_searched(p, Restriction(("unnamed_force",)))
+    with pytest.raises(InputError):
+        check_searched(p, Restriction(("contact_stop",)))
 
 
 @pytest.mark.parametrize("reading", [1e300, -1e101])

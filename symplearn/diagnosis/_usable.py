@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from .._effects import UNNAMED
 from .._errors import InputError, shown
 from .._recording import Recording
 from .._simulation_records import SimulationFile
@@ -63,7 +64,7 @@ def check_fitted(file: SimulationFile, problem: Problem, holdout: float) -> None
 
 def check_searched(problem: Problem, restriction: Restriction) -> None:
     """Some effect that was asked for can be in the simulation. `InputError` otherwise."""
-    if restriction.effects is not None and not problem.searched:
+    if restriction.effects is not None and not (problem.searched or restriction.has(UNNAMED)):
         raise InputError(
             f"--effects: the simulation has nothing that {', '.join(restriction.effects)} could act on; "
             "name others, or leave the option out"
