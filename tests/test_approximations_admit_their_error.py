@@ -89,7 +89,7 @@ def test_bad_options_are_one_sentence():
     for wrong, sentence in (
         (lambda: Pathfinder(reach=0.0), "`Pathfinder` needs a `reach` above 0, but was given 0.0."),
         (lambda: VariationalInference(rate=-1.0), "`VariationalInference` needs a `rate` above 0, but was given -1.0."),
-        (lambda: VariationalInference(batch=0), "`batch` of at least 1, but was given 0"),
+        (lambda: VariationalInference(batch=0), "`batch` of at least 1, a whole number, but was given 0"),
         (lambda: MCLMC(acceptance=1.0), "`MCLMC` needs `acceptance` between 0 and 1, but was given 1.0."),
         (lambda: drawn(lambda x: -0.5 * x[0] ** 2, MCLMC(), (0.0,)), "needs two parameters .* sample with `NUTS`"),
     ):

@@ -104,7 +104,7 @@ def test_effective_size_of_resampled_weights_is_kish():
 def test_bad_options_are_one_sentence():
     """Numbers that no sampler can work with are refused before anything is computed."""
     for wrong, sentence in (
-        (lambda: RandomWalk(chains=1), "`RandomWalk` needs `chains` of at least 2, but was given 1."),
+        (lambda: RandomWalk(chains=1), "`RandomWalk` needs `chains` of at least 2, a whole number, but was given 1."),
         (lambda: NUTS(acceptance=1.0), "`acceptance` between 0 and 1"),
         (lambda: AdaptiveImportance(dof=2.0), "`dof` above 2"),
         (lambda: sample_density(normal, 0.0, key=jax.random.key(0)), "a vector to start from"),
