@@ -17,8 +17,8 @@ from ._start import priors_without_effects, scattered
 _LARGEST = 1e100
 # Substeps that can be laid out in all, some hundred megabytes of times.
 _STEPS = 2e7
-# Starts at which the equations of motion are looked at, a few at a time.
-_TRIED, _AT_ONCE = 24, 3
+# Starts at which the equations of motion are looked at together.
+_AT_ONCE = 3
 _SAID = {
     "velocities that follow from the Hamiltonian": velocity,
     "forces that follow from the Hamiltonian": force,
@@ -74,9 +74,12 @@ def check_searched(problem: Problem, restriction: Restriction) -> None:
 def check_motion(file: SimulationFile, problem: Problem) -> None:
     """What moves the simulation and what is read of it are numbers at some start. `InputError` otherwise."""
     priors = priors_without_effects(problem)
-    starts = scattered(problem, priors)[:_TRIED, : problem.state]
+    starts = scattered(problem, priors)[:, : problem.state]
     for said, what in _SAID.items():
-        tried = (along(problem, what, 0, priors.mean, (), starts[k : k + _AT_ONCE]) for k in range(0, _TRIED, _AT_ONCE))
+        tried = (
+            along(problem, what, 0, priors.mean, (), starts[k : k + _AT_ONCE])
+            for k in range(0, len(starts) - _AT_ONCE, _AT_ONCE)
+        )
         if not any(np.isfinite(found).all(1).any() for found in tried):
             raise InputError(
                 f"{file.name}: the {said} are no numbers wherever the motion starts; look for a division by zero or "
