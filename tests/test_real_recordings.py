@@ -5,7 +5,7 @@ import pytest
 from contract import check_document
 from real_recordings import document_of, effects, rmse
 
-# Each takes about a minute, the last one four.
+# Each takes about a minute, the last one up to sixteen beside other work.
 pytestmark = [pytest.mark.recordings, pytest.mark.slow]
 DRY, DRAG, VISCOUS = "coulomb_friction", "quadratic_drag", "viscous_damping"
 
