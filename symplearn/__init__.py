@@ -126,6 +126,9 @@ from ._prior import Prior as Prior
 from ._profile_likelihood import Profile as Profile
 from ._profile_likelihood import profile_likelihood as profile_likelihood
 from ._random_walk import RandomWalk as RandomWalk
+from ._reading_slopes import CentralDifference as CentralDifference
+from ._reading_slopes import ForwardDifference as ForwardDifference
+from ._reading_slopes import TotalVariation as TotalVariation
 from ._realisation import CorrectedHankel as CorrectedHankel
 from ._realisation import PrintedHankel as PrintedHankel
 from ._realisation import Realisation as Realisation
@@ -145,15 +148,12 @@ from ._simulation_records import SimulationFile as SimulationFile
 from ._simulation_text import simulation_text as simulation_text
 from ._smoother import Smoothed as Smoothed
 from ._smoother import smooth as smooth
-from ._sparse_regression import CentralDifference as CentralDifference
-from ._sparse_regression import ForwardDifference as ForwardDifference
 from ._sparse_regression import ForwardEuler as ForwardEuler
-from ._sparse_regression import Lasso as Lasso
 from ._sparse_regression import PolynomialLibrary as PolynomialLibrary
-from ._sparse_regression import SequentialThresholding as SequentialThresholding
 from ._sparse_regression import SparseModel as SparseModel
-from ._sparse_regression import TotalVariation as TotalVariation
 from ._sparse_regression import sindy as sindy
+from ._sparsity import Lasso as Lasso
+from ._sparsity import SequentialThresholding as SequentialThresholding
 from ._symbolic import jax_function as jax_function
 from ._tempered_smc import TemperedSMC as TemperedSMC
 from ._train import Trained as Trained

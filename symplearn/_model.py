@@ -14,7 +14,7 @@ import integrators as ig
 
 from ._counts import refuse_count
 from ._errors import InputError
-from ._model_checks import refuse_asymmetric, refuse_matrix, refuse_misfit, shape_of
+from ._model_checks import length_of, refuse_asymmetric, refuse_matrix, refuse_misfit, shape_of
 from ._noise import AdditiveGaussian, WienerIncrement, enter
 from ._parameters import AbstractKnown
 from ._small_products import product
@@ -45,8 +45,7 @@ class Gaussian(AbstractKnown):
     @property
     def size(self) -> int | None:
         """d, or None where it cannot be told."""
-        shape = shape_of(self.mean)
-        return shape[-1] if shape else None
+        return length_of(self.mean)
 
     @property
     def root(self) -> Float[Array, "d d"]:
@@ -312,9 +311,9 @@ class StateSpaceModel(AbstractStateSpaceModel):
 
     def _refuse_misfits(self, state: int) -> None:
         if isinstance(self.dynamics, LinearDynamics):
-            refuse_misfit("dynamics", _columns(self.dynamics.A), state)
+            refuse_misfit("dynamics", length_of(self.dynamics.A), state)
         if isinstance(self.observation, LinearObservation):
-            refuse_misfit("observation", _columns(self.observation.matrix), state)
+            refuse_misfit("observation", length_of(self.observation.matrix), state)
         if isinstance(self.observation, Coordinates):
             self.observation.refuse_beyond(state)
         refuse_misfit("process noise", _size_of(self.process_noise), state)
@@ -330,11 +329,6 @@ class StateSpaceModel(AbstractStateSpaceModel):
 
     def read(self, transform, mean, root, context) -> Moments:
         return enter(self.measurement_noise, _pass(transform, self.observation, mean, root, context), context)
-
-
-def _columns(matrix: Any) -> int | None:
-    shape = shape_of(matrix)
-    return shape[-1] if shape else None
 
 
 def _size_of(noise: Any) -> int | None:

@@ -25,6 +25,12 @@ def shape_of(given: Any) -> tuple[int, ...] | None:
     return None if given is None or isinstance(given, eqx.Module) else np.shape(given)
 
 
+def length_of(given: Any) -> int | None:
+    """How many numbers the last axis has, as a vector or the columns of a matrix; None where it cannot be told."""
+    shape = shape_of(given)
+    return shape[-1] if shape else None
+
+
 def _bare(given: Any) -> Any:
     """A number or an array without what keeps it from learning, or lets it learn freely."""
     while isinstance(given, Frozen | Learnt):

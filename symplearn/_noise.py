@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ._counts import refuse_count
 from ._errors import InputError
-from ._model_checks import refuse_asymmetric, shape_of
+from ._model_checks import length_of, refuse_asymmetric, shape_of
 from ._parameters import AbstractKnown, AbstractParameter
 from ._small_products import product
 from ._transforms import Moments, with_noise
@@ -149,8 +149,7 @@ class Dense(AbstractCovariance):
 
     @property
     def size(self) -> int | None:
-        shape = shape_of(self.covariance)
-        return shape[-1] if shape else None
+        return length_of(self.covariance)
 
     @property
     def matrix(self) -> Float[Array, "dim dim"]:
@@ -178,8 +177,7 @@ class Correlated(AbstractCovariance):
 
     @property
     def size(self) -> int | None:
-        shape = shape_of(self.correlation)
-        return shape[-1] if shape else None
+        return length_of(self.correlation)
 
     @property
     def matrix(self) -> Float[Array, "dim dim"]:

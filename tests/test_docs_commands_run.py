@@ -50,28 +50,28 @@ def test_commands_of_the_page(checkout):
     assert first["verdict"] == "mismatch" and again["verdict"] in ("consistent", "unexplained")
 
 
-@pytest.mark.slow
-def test_snippet_of_the_readme(checkout):
-    """The README's Python runs, prints the finding, and gives the simulation with the finding put back."""
+def printed(text, checkout):
+    """What the only Python block of a page prints."""
     folder, places = checkout
-    (snippet,) = blocks(README, "python")
+    (snippet,) = blocks(text, "python")
     done = subprocess.run(
         [sys.executable, "-c", snippet], cwd=folder, env=places, capture_output=True, text=True, timeout=600
     )
     assert done.returncode == 0, done.stderr
-    assert "mismatch" in done.stdout and 'effect = "viscous_damping"' in done.stdout
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_snippet_of_the_readme(checkout):
+    """The README's Python runs, prints the finding, and gives the simulation with the finding put back."""
+    out = printed(README, checkout)
+    assert "mismatch" in out and 'effect = "viscous_damping"' in out
 
 
 @pytest.mark.slow
 def test_python_of_the_page(checkout):
     """The page's Python, with `Options`, finds among the effects that it names what the demo left out."""
-    folder, places = checkout
-    (snippet,) = blocks(PAGE, "python")
-    done = subprocess.run(
-        [sys.executable, "-c", snippet], cwd=folder, env=places, capture_output=True, text=True, timeout=600
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("mismatch ")
+    assert printed(PAGE, checkout).startswith("mismatch ")
 
 
 def test_page_shows_the_file_that_ships():

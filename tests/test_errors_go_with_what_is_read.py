@@ -46,7 +46,7 @@ def test_the_error_is_what_a_dense_process_expects(ratio):
     one = _Channel(np.concatenate([columns, shapes * root]), 4, np.ones(50, bool), 0.7, Shapes((-2.0, 3.0)))
     found, prior = one.bend(column, ratio, 0.3), ratio / 13 * shapes.T @ shapes
     taken = prior @ np.linalg.inv(prior + np.diag(1 / root**2))
-    # 1e-9, here and below: round-off of two ways to solve, with a matrix of condition 4000.
+    # Here and below round-off of two ways to solve, with a matrix of condition 4000; times say nothing of it.
     np.testing.assert_allclose(found(seen, np.arange(50.0)), taken @ (column @ columns / root), rtol=1e-9)
     left = np.average(np.diag(prior - taken @ prior), weights=root**2)
     assert found.spread == pytest.approx(0.3 * np.sqrt(left), rel=1e-9)

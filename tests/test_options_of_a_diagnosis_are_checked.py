@@ -2,27 +2,16 @@
 
 import math
 
+import engine_cases as cases
 import jaxtyping
 import numpy as np
 import pytest
 
-from symplearn import InputError, Options, diagnose, parse_simulation, restriction_of
+from symplearn import InputError, Options, diagnose, restriction_of
 from symplearn._effects import EFFECTS
 from symplearn.diagnosis import Restriction
 
-SIMULATION = parse_simulation(
-    """
-[system]
-coordinates = ["q"]
-momenta = ["p"]
-hamiltonian = "p**2/2 + q**2/2"
-[recording]
-time = "t"
-[recording.observe]
-a = "q"
-""",
-    "s.toml",
-)
+SIMULATION = cases.simulation("p**2/2 + q**2/2")
 
 
 @pytest.fixture(autouse=True)

@@ -27,6 +27,7 @@ def test_pendulum_with_two_balls():
     check_document(document, ["angle_deg"], ["p"])
     assert VISCOUS in effects(document) and dissipation(document) > 0.99
     (viscous,) = (f for f in document["findings"] if f["effect"] == VISCOUS)
+    # A quarter, as the modulation takes a part of the loss: 1.27e-3 was seen beside it, against 1.08e-3.
     assert viscous["coefficients"]["c"]["mean"] == pytest.approx(0.167 * 0.006452, rel=0.25)
     assert rmse(document, "before") / rmse(document, "after") >= 15
     assert rmse(document, "after") < np.rad2deg(0.0044)  # the README's best: viscous, dry and an offset

@@ -13,17 +13,9 @@ from symplearn._model import FullState, Gaussian, Interval, StateSpaceModel, int
 from symplearn._noise import AdditiveGaussian, ScaledIdentity
 from symplearn._objectives import TimeSeries
 from symplearn._prior import Laplace
-from symplearn._sparse_regression import (
-    CentralDifference,
-    ForwardDifference,
-    ForwardEuler,
-    Lasso,
-    PolynomialLibrary,
-    SequentialThresholding,
-    SparseModel,
-    TotalVariation,
-    sindy,
-)
+from symplearn._reading_slopes import CentralDifference, ForwardDifference, TotalVariation
+from symplearn._sparse_regression import ForwardEuler, PolynomialLibrary, SparseModel, sindy
+from symplearn._sparsity import Lasso, SequentialThresholding
 
 DT, N, MU = 0.1, 20, 1.0
 CUBIC = PolynomialLibrary(2, 3)

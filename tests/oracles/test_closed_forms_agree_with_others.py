@@ -11,7 +11,9 @@ from sklearn import linear_model
 
 from symplearn._dynamic_modes import dmd, total_dmd
 from symplearn._objectives import TimeSeries
-from symplearn._sparse_regression import CentralDifference, Lasso, PolynomialLibrary, SequentialThresholding, sindy
+from symplearn._reading_slopes import CentralDifference
+from symplearn._sparse_regression import PolynomialLibrary, sindy
+from symplearn._sparsity import Lasso, SequentialThresholding
 
 # Round-off of well-conditioned least squares: 1e-16 times a condition number below 1e4, and two digits of room.
 # Two packages that solve the same problem agree to it; every comparison below that names TOLERANCE is of this kind.
