@@ -11,6 +11,7 @@ from ._foreign_call import registered
 from ._machine_arithmetic import Unsupported
 from ._machine_lanes import lane_loop
 from ._native import compiled
+from ._scan_sizes import ScanSizes
 
 
 class Known:
@@ -31,7 +32,7 @@ class Loop:
     """A loop's parameters, to be found again by the traced function that it repeats."""
 
     def __init__(self, p: Any):
-        self.p, self.key = p, tuple(p[name] for name in ("length", "reverse", "num_consts", "num_carry", "known"))
+        self.p, self.key = p, (p["length"], p["reverse"], *ScanSizes.of(p), p["known"])
 
     def __hash__(self) -> int:
         return hash((id(self.p["jaxpr"]), self.key))

@@ -17,6 +17,7 @@ from jax.interpreters import ad, batching, mlir
 
 from ._lane_code import Known, Loop, code_of
 from ._machine_lanes import filling
+from ._scan_sizes import ScanSizes
 
 _Told = TypeVar("_Told")
 # Numbers of an array that is written into a loop's function.
@@ -93,7 +94,7 @@ def _bound(values: Sequence[Any], p: Any) -> list[Any]:
     """A loop as an operation of its own. What it is given and is known is written into its function: places in arrays,
     and matrices most of whose entries are zero."""
     inner, known = p["jaxpr"].jaxpr, {}
-    for k, value in enumerate(values[: p["num_consts"]]):
+    for k, value in enumerate(values[: ScanSizes.of(p).given]):
         if not isinstance(value, jax.core.Tracer) and np.size(value) <= _WRITTEN:
             known[k] = np.asarray(value, inner.invars[k].aval.dtype)
     return loop.bind(*values, known=Known(known), **p)
@@ -201,9 +202,9 @@ def _filled(value: Any, lanes: int) -> Any:
 
 def _yielded(p: Any, *lanes: int) -> list[Any]:
     """Shapes and types of what a loop yields, lanes last."""
-    out = []
+    out, carried = [], ScanSizes.of(p).carried
     for k, aval in enumerate(p["jaxpr"].out_avals):
-        along = () if k < p["num_carry"] else (p["length"],)
+        along = () if k < carried else (p["length"],)
         out.append(jax.core.ShapedArray((*along, *aval.shape, *lanes), aval.dtype))
     return out
 

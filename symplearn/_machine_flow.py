@@ -15,6 +15,7 @@ from ._machine_cells import Cells
 from ._machine_kernels import copied
 from ._machine_loops import counted
 from ._machine_memory import AbstractCode, AbstractTable, BlockTable, shaped
+from ._scan_sizes import ScanSizes
 
 # Loops of at most so many steps are written down step by step where that tells places in arrays.
 _FEW = 16
@@ -119,16 +120,16 @@ def _while(code: AbstractCode, one: JaxprEqn, values: list[Any]) -> list[Any]:
 
 
 def _scan(code: AbstractCode, one: JaxprEqn, values: list[Any]) -> list[Any]:
-    p = one.params
-    given, last, length = p["num_consts"], p["num_consts"] + p["num_carry"], p["length"]
+    p, sizes = one.params, ScanSizes.of(one.params)
+    given, last, length = sizes.given, sizes.last, p["length"]
     if code.beside and length <= _FEW and (p["unroll"] >= length or _asks_for_places(p["jaxpr"].jaxpr)):
         return _step_by_step(code, one, values)
-    told = one.outvars[p["num_carry"] :]
+    told = one.outvars[sizes.carried :]
     if told and not code.beside:
         raise Unsupported("a loop that tells what it passes")
     rooms = [code.room_for(shaped(atom).dtype, shaped(atom).shape) for atom in told]
     tables = [value if isinstance(value, AbstractTable) else code.table(value) for value in values[last:]]
-    cells = Cells(code, one.outvars[: p["num_carry"]])
+    cells = Cells(code, one.outvars[: sizes.carried])
     cells.store(values[given:last])
     cells.slope_all()
     looped(code, p, values[:given], cells, tables, rooms)
@@ -147,15 +148,16 @@ def looped(
     with counted(code.builder, ir.Constant(INTEGER, p["length"])) as k:
         place = code.builder.sub(ir.Constant(INTEGER, p["length"] - 1), k) if p["reverse"] else k
         found = code.evaluated(p["jaxpr"], [*given, *cells.load(), *(table.row(code, place) for table in tables)])
-        for room, values in zip(rooms, found[p["num_carry"] :], strict=True):
+        carried = ScanSizes.of(p).carried
+        for room, values in zip(rooms, found[carried:], strict=True):
             room.set_row(code, place, values)
-        cells.store(found[: p["num_carry"]])
+        cells.store(found[:carried])
 
 
 def _step_by_step(code: AbstractCode, one: JaxprEqn, values: list[Any]) -> list[Any]:
     """A short loop, every step of which is written down, so that places in arrays are known."""
-    p = one.params
-    given, last, carried = p["num_consts"], p["num_consts"] + p["num_carry"], p["num_carry"]
+    p, sizes = one.params, ScanSizes.of(one.params)
+    given, last, carried = sizes.given, sizes.last, sizes.carried
     now, told = values[given:last], []
     for k in range(p["length"])[:: -1 if p["reverse"] else 1]:
         rows = [_row_of(code, value, k) for value in values[last:]]

@@ -19,6 +19,7 @@ from ._machine_loops import counted
 from ._machine_memory import AbstractCode, AbstractTable
 from ._machine_sizes import is_worth_blocks, largest_array, largest_product
 from ._native import span
+from ._scan_sizes import ScanSizes
 
 # How many lanes one register may have.
 WIDTHS = (1, 4, 8)
@@ -171,7 +172,8 @@ class _Lanes:
     def _some(self, first: ir.Value) -> None:
         """The loop over time of the lanes from `first` on."""
         p, program = self.p, self.p["jaxpr"].jaxpr
-        given, last = p["num_consts"], p["num_consts"] + p["num_carry"]
+        sizes = ScanSizes.of(p)
+        given, last, carried = sizes.given, sizes.last, sizes.carried
         streams = [self._stream(self.arguments, k, atom, k >= last, self.lanes if self.beside[k] else None, first)
                    for k, atom in enumerate(program.invars)]  # fmt: skip
         values = [self.code.constant(self.known[k]) if k in self.known else self._all(stream, k < given)
@@ -179,11 +181,11 @@ class _Lanes:
         self._prepare()
         cells = Cells(self.code, program.invars[given:last])
         cells.store(values[given:])
-        rooms = [self._stream(self.results, k, atom, k >= p["num_carry"], self.lanes, first)
+        rooms = [self._stream(self.results, k, atom, k >= carried, self.lanes, first)
                  for k, atom in enumerate(program.outvars)]  # fmt: skip
-        looped(self.code, p, values[:given], cells, streams[last:], rooms[p["num_carry"] :])
+        looped(self.code, p, values[:given], cells, streams[last:], rooms[carried:])
         self._prepared()
-        for room, array in zip(rooms[: p["num_carry"]], cells.load(), strict=True):
+        for room, array in zip(rooms[:carried], cells.load(), strict=True):
             room.set_all(self.code, array)
 
     def _gathered(self, block: Block) -> Block:

@@ -84,6 +84,12 @@ def _known_places(places: np.ndarray) -> np.ndarray:
     return np.moveaxis(np.array(found, int).reshape(places.shape), -1, 0)
 
 
+def _rows(on: Arithmetic, one: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
+    """The entries along an axis, which are arrays even where they are single numbers."""
+    along = np.moveaxis(values[0], one.params["axis"], 0)
+    return [along[k, ...] for k in range(len(along))]
+
+
 def _counted(on: Any, one: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
     p = one.params
     return [on.constant(np.indices(p["shape"])[p["dimension"]].astype(p["dtype"]))]
@@ -161,6 +167,6 @@ PLACED: dict[str, _Place] = {
     "split": lambda on, one, values: np.split(values[0], np.cumsum(one.params["sizes"])[:-1], one.params["axis"]),
     "squeeze": _moved(lambda array, p: np.squeeze(array, p["dimensions"])),
     "stack": lambda on, one, values: [np.stack(values, one.params["axis"])],
-    "unstack": lambda on, one, values: list(np.moveaxis(values[0], one.params["axis"], 0)),
+    "unstack": _rows,
     "transpose": _moved(lambda array, p: np.transpose(array, p["permutation"])),
 }

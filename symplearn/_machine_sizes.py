@@ -7,6 +7,7 @@ from jax.extend.core import Jaxpr, JaxprEqn
 
 from ._machine_flow import programs_in
 from ._machine_memory import shaped
+from ._scan_sizes import ScanSizes
 
 # Products of numbers, in those of matrices, for each number that a step yields on the way, from which on blocks are
 # worth their memory: XLA does the rest as well. A chain of eight springs has 0.4 and took up to three times as long
@@ -39,7 +40,7 @@ def _products_of(one: JaxprEqn) -> int:
 
 def is_worth_blocks(p: Any) -> bool:
     """Whether a loop's time is that of products of matrices."""
-    program, left = p["jaxpr"].jaxpr, sum(one.size for one in p["jaxpr"].out_avals[: p["num_carry"]])
+    program, left = p["jaxpr"].jaxpr, sum(one.size for one in p["jaxpr"].out_avals[: ScanSizes.of(p).carried])
     return _work(program) >= max(_WORTH * _yielded(program), _WORTH_COPIES * left)
 
 
