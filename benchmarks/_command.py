@@ -8,6 +8,7 @@ from typing import NoReturn
 
 from symplearn._errors import InputError, nearest, printable, shown
 
+from ._machine import card
 from ._results import Results, put
 from ._row import Effort, Row, tell
 from ._rows import ROWS, row_of
@@ -60,14 +61,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _chosen(names: Sequence[str]) -> list[Row]:
-    """The rows of these names, or all.
+    """The rows of these names, or all that this machine may have: those of a graphics card where there is one.
 
     **Raises:** `InputError` where there is no such row.
     """
     for name in names:
         if row_of(name) is None:
             raise InputError(f"there is no row {shown(name)}; {nearest(name, [row.name for row in ROWS])}")
-    return [row for row in ROWS if not names or row.name in names]
+    if names:
+        return [row for row in ROWS if row.name in names]
+    return [row for row in ROWS if not row.on_card or card() is not None]
 
 
 def _measure(rows: Sequence[Row], results: Results, effort: Effort) -> int:
@@ -76,11 +79,7 @@ def _measure(rows: Sequence[Row], results: Results, effort: Effort) -> int:
     code = 0
     for row in rows:
         if row.missing:
-            print(
-                f"benchmarks: {row.name} needs {' and '.join(row.missing)}, which `make benchmarks` installs in an "
-                "environment of its own",
-                file=sys.stderr,
-            )
+            print(f"benchmarks: {row.name} needs {' and '.join(row.missing).rstrip(',')}", file=sys.stderr)
             code = max(code, 2)
             continue
         tell(f"{row.name}: {row.about}")

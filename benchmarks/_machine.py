@@ -1,8 +1,11 @@
 """The machine, the versions, and how busy others kept it."""
 
+import functools
 import os
 import platform
 import resource
+import subprocess
+import sys
 import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -17,11 +20,24 @@ def machine() -> dict[str, Any]:
         "processor": _processor(),
         "cores": _cores(),
         "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "card": card(),
         "system": platform.system(),
         "python": platform.python_version(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
         "versions": {name: _version(name) for name in _PACKAGES},
     }
+
+
+@functools.cache
+def card() -> str | None:
+    """The name of the graphics card that JAX computes on; None where there is none.
+
+    A process of its own asks, so that this one takes none of the card's memory.
+    """
+    code = "import jax; print(jax.default_backend(), jax.devices()[0].device_kind, sep='\\n')"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    kind, _, name = found.stdout.strip().partition("\n")
+    return name if found.returncode == 0 and kind == "gpu" else None
 
 
 def _processor() -> str:

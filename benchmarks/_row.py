@@ -6,6 +6,8 @@ import sys
 import time
 from typing import Any, NamedTuple
 
+from ._machine import card
+
 _BEGAN = time.monotonic()
 
 
@@ -46,16 +48,22 @@ class Line(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A row: its module is `benchmarks.<name>`, whose `measure(effort)` gives figures with a list of `Line`."""
+    """A row: its module is `benchmarks.<name>`, whose `measure(effort)` gives figures with a list of `Line`.
+
+    Those `on_card` are of a graphics card, and left out where there is none.
+    """
 
     name: str
     about: str
     peers: tuple[str, ...] = ()
+    on_card: bool = False
 
     @property
     def missing(self) -> list[str]:
-        """The peers that are not installed."""
-        return [peer for peer in self.peers if importlib.util.find_spec(peer) is None]
+        """The peers that are not installed, and a card where it needs one."""
+        peers = [f"{peer}, which `make benchmarks` installs in an environment of its own,"
+                 for peer in self.peers if importlib.util.find_spec(peer) is None]  # fmt: skip
+        return peers + (["a graphics card that JAX computes on"] if self.on_card and card() is None else [])
 
     def measure(self, effort: Effort) -> dict[str, Any]:
         """Numbers for JSON, with `lines` for the table."""

@@ -22,6 +22,11 @@ ROWS = (
     Row("diagnosing", "`symplearn demo` cold and warm, processes of their own"),
     Row("answering", "Henon-Heiles from a recording to the most probable model, warm"),
     Row("whole_loops", "what the option of XLA that symplearn sets does for dynamax, and for symplearn", _DYNAMAX),
+    Row("card_chains", "10,000 chains at once on a graphics card, in double and single precision", on_card=True),
+    Row("card_posterior", "the posterior of Henon-Heiles by 10,000 chains on a graphics card", on_card=True),
+    Row("card_networks", "the sweep of Tao's example, 1,760 trainings, on a graphics card", on_card=True),
+    Row("card_kalman", "the Kalman filter with all readings side by side on a graphics card", on_card=True),
+    Row("card_diagnosis", "a diagnosis of a hundred recordings on a machine with a graphics card", on_card=True),
 )
 
 

@@ -54,7 +54,8 @@ def markdown(results: Results) -> str:
     versions = ", ".join(f"{name} {one}" for name, one in told["versions"].items() if one)
     flags = f", `XLA_FLAGS={told['xla_flags']}`" if told["xla_flags"] else ""
     missing = [name for name, row in results.rows.items() if row is None]
-    head = (
+    head = f"{told['card']}; " if told["card"] else ""
+    head += (
         f"{told['processor']}, {told['cores']} of its cores, {told['memory_gib']} GiB, {told['system']}; "
         f"Python {told['python']}, {versions}{flags}."
     )

@@ -25,7 +25,7 @@ _WRITTEN = 4096
 # Steps from which on a loop inside of one that is XLA's is worth a call of its own in each of that one's steps.
 _LONG = 64
 # Traced functions that are looked into for loops, and where they keep what they do; not those with slopes of their own.
-_CALLS = {"closed_call": "call_jaxpr", "jit": "jaxpr", "remat2": "jaxpr"}
+_CALLS = {"closed_call": "call_jaxpr", "eval_jaxpr": "call_jaxpr", "jit": "jaxpr", "remat2": "jaxpr"}
 
 
 _left_to_xla = ContextVar("left to XLA", default=False)

@@ -271,6 +271,7 @@ PARTS: dict[str, Callable[[AbstractCode, JaxprEqn, list[Any]], list[Any]]] = {
     "custom_vjp_call": _without_slopes,
     "dynamic_slice": _looked_up,
     "dynamic_update_slice": _replaced,
+    "eval_jaxpr": _inlined_call,  # a closed call, from JAX 0.11 on
     "jit": _inlined,
     "platform_index": _on_a_processor,
     "remat2": _inlined_open,

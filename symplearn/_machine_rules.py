@@ -133,6 +133,13 @@ def _power(on: Arithmetic, p: Any, a: Dual, b: Dual) -> Dual:
     return Dual(value, slope)
 
 
+def _one_minus_square(on: Arithmetic, p: Any, a: Dual) -> Dual:
+    """1 - x^2, from JAX 0.11 on an operation of its own, which is accurate near 1."""
+    one = on.number(1.0)
+    value = on.times(on.plus(one, a.value), on.minus(one, a.value))
+    return Dual(value, None if a.slope is None else on.times(on.times(on.number(-2.0), a.value), a.slope))
+
+
 def _direction(on: Arithmetic, p: Any, y: Dual, x: Dual) -> Dual:
     value, slope = on.called("atan2", y.value, x.value), None
     if y.slope is not None or x.slope is not None:
@@ -269,6 +276,7 @@ RULES: dict[str, _Rule] = {
     "ne": _compared("!="),
     "neg": _negative,
     "not": lambda on, p, a: Dual(on.builder.not_(a.value)),
+    "one_minus_square": _one_minus_square,
     "or": _bits("or_"),
     "pow": _power,
     "select_n": _chosen,

@@ -1,5 +1,5 @@
-"""Double precision, a garbage collector for much that stays, and what a process of the command line keeps in the
-user's cache folder."""
+"""Double precision on the processor, a garbage collector for much that stays, and what a process of the command line
+keeps in the user's cache folder."""
 
 import atexit
 import gc
@@ -21,6 +21,9 @@ def prepare(cache: bool) -> None:
     gc.freeze()
     gc.set_threshold(*_COLLECTED)
     jax.config.update("jax_enable_x64", True)
+    if not os.environ.get("JAX_PLATFORMS"):
+        # A diagnosis is machine code and small arrays, for each of which a graphics card has to be called.
+        jax.config.update("jax_platforms", "cpu")
     folder = _private_folder() if cache else None
     # Left to itself matplotlib keeps its font list in a folder of its own.
     if "MPLCONFIGDIR" not in os.environ:

@@ -6,6 +6,7 @@ import numpy as np
 from jax import lax
 
 from symplearn._guard import guard
+from symplearn._machine_rules import RULES
 
 POINT = np.array([0.7, -0.4, 1.3])
 
@@ -36,3 +37,8 @@ OF_ONE = {
     "is_finite": lambda x: jnp.where(jnp.isfinite(1 / (x - 0.7)), x, 2.0),
     "convert_element_type": lambda x: x * (x > 0) + (x > 0).astype(int).astype(float) + (3 * x).astype(int),
 }  # fmt: skip
+# An operation of its own from JAX 0.11 on.
+if hasattr(lax, "one_minus_square"):
+    OF_ONE["one_minus_square"] = lax.one_minus_square
+# Those that this version of JAX has.
+NAMES = [name for name in RULES if name in OF_ONE or name != "one_minus_square"]

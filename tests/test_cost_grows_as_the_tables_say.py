@@ -6,8 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from operation_count import operations
 
+from benchmarks._operations import operations
 from symplearn._filter import log_likelihood
 from symplearn._model import Gaussian, LinearDynamics, LinearObservation, StateSpaceModel
 from symplearn._noise import Additive, AdditiveGaussian, Dense, Diagonal, Multiplicative, ScaledIdentity

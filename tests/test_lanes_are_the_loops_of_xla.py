@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from machine_operations import OF_ONE, POINT
+from machine_operations import NAMES, OF_ONE, POINT
 
 import integrators as ig
 import symplearn as sl
@@ -15,7 +15,6 @@ from symplearn import _filter, _lane_loops, _machine_lanes, _native
 from symplearn._filter import SEQUENTIAL
 from symplearn._lane_loops import left_to_xla, with_lane_loops
 from symplearn._log_posterior import gradient, guarded
-from symplearn._machine_rules import RULES
 from symplearn._objectives import prepare
 from symplearn._parameters import flatten, resolve
 from symplearn._sampler import whitened
@@ -54,7 +53,7 @@ def check(function, number, monkeypatch):
     assert names and None not in names
 
 
-@pytest.mark.parametrize("name", RULES)
+@pytest.mark.parametrize("name", NAMES)
 def test_every_operation_is_that_of_xla(name, monkeypatch):
     """Each operation that is known, as a step of a loop of eleven lanes and of one."""
     one = OF_ONE[name]

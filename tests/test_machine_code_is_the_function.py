@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from jax import lax
 from llvmlite import ir
-from machine_operations import OF_ONE, POINT
+from machine_operations import NAMES, OF_ONE, POINT
 
 from symplearn._machine_arithmetic import DOUBLE, Dual, Unsupported
 from symplearn._machine_code import Code
-from symplearn._machine_rules import RULES
 from symplearn._native import compiled
 from symplearn.diagnosis._row_loop import _array
 
@@ -62,7 +61,7 @@ def check(function, point=POINT):
     np.testing.assert_allclose(slopes, expected, rtol=ROUND_OFF, atol=ROUND_OFF * max(1.0, np.abs(expected).max()))
 
 
-@pytest.mark.parametrize("name", RULES)
+@pytest.mark.parametrize("name", NAMES)
 def test_every_operation_is_that_of_jax(name):
     """Each operation that is known gives JAX's values and slopes, on both sides of what it depends on."""
     assert name in str(jax.make_jaxpr(OF_ONE[name])(jnp.asarray(POINT)))
