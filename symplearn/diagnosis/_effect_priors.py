@@ -13,8 +13,8 @@ from ._motion import Motion, rms
 from ._problem import Problem
 from ._unnamed import Proposal
 
-# Prior scale of an effect: its force against the forces already there, its error against the reading's spread, its
-# change of a parameter against the parameter.
+# Prior scale of an effect: its force against the forces already there, its error against the reading, its change of a
+# parameter against the parameter. Readings count from zero, which is the sensor's: a bias errs as much as a scale does.
 STRENGTH = 0.3
 # A stop bears the forces already there at this share of the motion's range, or softer.
 _DEPTH = 0.005
@@ -68,8 +68,8 @@ def _unseen(motion: Motion, i: int, loose: float) -> tuple[float, float]:
 def _unit(motion: Motion, one: Candidate) -> tuple[float, ...]:
     """Amplitudes as strong as what is already there."""
     if one.effect.acts_on == effects.COLUMN:
-        spread = motion.spreads[one.place]
-        units = {effects.BIAS: spread, effects.GAIN: 1.0, effects.DRIFT: _EVEN * spread / motion.span}
+        level = motion.levels[one.place]
+        units = {effects.BIAS: level, effects.GAIN: 1.0, effects.DRIFT: _EVEN * level / motion.span}
         return (units.get(one.effect, _SAMPLES / 2 * motion.gap / STRENGTH),) * one.effect.amplitudes
     if one.effect.acts_on == effects.PARAMETER:
         later = {effects.DRIFTING: _EVEN / motion.span, effects.REGIME: _HALF}

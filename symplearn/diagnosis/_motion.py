@@ -33,7 +33,7 @@ class Motion:
     q: Float[np.ndarray, "row d"]
     v: Float[np.ndarray, "row d"]
     forces: Float[np.ndarray, " d"]  # root mean square
-    spreads: Float[np.ndarray, " channel"]  # standard deviation of the expected readings
+    levels: Float[np.ndarray, " channel"]  # root mean square of the expected readings
     times: tuple[Float[np.ndarray, " _"], ...]  # by recording
     # What the stiffness of each coordinate changes by, per unit of each calibrated parameter.
     stiffening: Float[np.ndarray, "d parameter"] = field(default_factory=lambda: np.zeros((1, 0)))
@@ -73,7 +73,7 @@ def motion_along(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarr
         q=np.concatenate([path[:, :d] for path in paths]),
         v=v[:, :d],
         forces=np.array([rms(push[:, i]) for i in range(d)]),
-        spreads=np.array([max(float(np.nanstd(column)), 1e-300) for column in shown.T]),
+        levels=np.array([rms(column) for column in shown.T]),
         times=tuple(r.times[: len(path)] for r, path in zip(problem.rows, paths, strict=True)),
         stiffening=stiffening(problem, z, paths),
     )

@@ -4,6 +4,7 @@ or less."""
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from .._effects import HIDDEN, STOP
 from ._depths import along_the_depths
@@ -12,7 +13,8 @@ from ._modes import along_the_modes
 from ._problem import MOST, Combination, Problem
 from ._prospects import MANY, Prospects
 from ._scan import spacing
-from ._score import Start
+from ._score import Start, inverse
+from ._strength import strength_entries
 from ._weigher import KEPT, Weigher
 
 # Combinations whose places are moved, and how near the best one is what is looked at.
@@ -138,7 +140,7 @@ class Refinement:
                     and (c not in self.found.estimates or self._is_behind(c, ranked))][: 2 * KEPT]  # fmt: skip
             if not some:
                 break
-            self.weigher.weigh([Start(c, self._shrunk(c, ranked), 0.0) for c in some], whole=True)
+            self.weigher.weigh([Start(c, z, 0.0) for c in some for z in self._shrunk(c, ranked)], whole=True)
             tried.update(some)
 
     def _mine(self) -> list[Combination]:
@@ -189,9 +191,15 @@ class Refinement:
                 z[place] = mine.z[place]
         return z
 
-    def _shrunk(self, combination: Combination, ranked: Sequence[Combination]) -> np.ndarray:
-        """Where a combination begins that lacks one member of a fitted one: at that one's values."""
+    def _shrunk(self, combination: Combination, ranked: Sequence[Combination]) -> list[Float[np.ndarray, " z"]]:
+        """Where a combination begins that lacks members of a fitted one: at that one's values, and at those that the
+        others take where these do nothing: one of two effects that do nearly the same then does the work of both."""
         larger = next(c for c in ranked if set(combination) < set(c))
         white = self.found.of(larger, "white")
         assert white is not None
-        return self.problem.carried(white.z, larger, combination)
+        gone = [strength_entries(self.problem, larger, member) for member in larger if member not in combination]
+        some, spread = np.concatenate(gone), white.covariance
+        others = white.z - spread[:, some] @ inverse(spread[np.ix_(some, some)]) @ white.z[some]
+        others = np.clip(others, *self.found.priors.bounds_of(self.problem, larger))
+        ways = [white.z, others] if len(some) and np.isfinite(others).all() else [white.z]
+        return [self.problem.carried(z, larger, combination) for z in ways]

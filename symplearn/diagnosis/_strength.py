@@ -13,7 +13,7 @@ nothing at zero (the moment prior of Johnson and Rossell 2010): what is not need
 import itertools
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.special import log_ndtr, logsumexp
 from scipy.stats import norm
 
@@ -50,7 +50,7 @@ def strength_gain(
     total, blocks = log_fed(problem, combination, priors, z, covariance), []
     alone = sum(problem.candidate(member).effect.amplitudes > 0 for member in combination) == 1
     for member in combination:
-        entries = _entries(problem, combination, member)
+        entries = strength_entries(problem, combination, member)
         if problem.candidate(member).effect is EXCITATION:
             total += turning_gain(
                 z[entries], covariance[np.ix_(entries, entries)], priors.scales[problem.candidate(member).values], alone
@@ -98,7 +98,7 @@ def turning_gain(centre: np.ndarray, spread: np.ndarray, scales: np.ndarray, alo
     return float(logsumexp(mass + turning + strength - wide) - logsumexp(mass))
 
 
-def _entries(problem: Problem, combination: Combination, member: int) -> np.ndarray:
+def strength_entries(problem: Problem, combination: Combination, member: int) -> Int[np.ndarray, " entry"]:
     """Where in z the amplitudes of one member stand, and the start of what it adds unseen."""
     place = dict(problem.placed(combination))[member]
     effect = problem.candidate(member).effect
