@@ -13,9 +13,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from blackjax.base import SamplingAlgorithm
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
+from ._blackjax import blackjax
 from ._counts import refuse_count
 from ._errors import InputError
 from ._sampler import possible
@@ -52,7 +52,7 @@ def dram(
     *,
     patience: int = 200,
     shrinkage: float = 0.01,
-) -> SamplingAlgorithm:
+) -> Any:
     """Delayed rejection adaptive Metropolis within Gibbs as blackjax has its kernels: `init(position)` and
     `step(key, state)`, for blackjax's own loops.
 
@@ -61,14 +61,14 @@ def dram(
     `blocks` - places that move together, as `blocks_of` gives them, or None for one block of all, and what is in none
     stays; `shrinkage` - the share of its covariance that a second proposal has.
 
-    **Returns:** a `SamplingAlgorithm`, whose states are `DRAMState` and whose infos are `DRAMInfo`.
+    **Returns:** a `blackjax.base.SamplingAlgorithm`, whose states are `DRAMState` and whose infos are `DRAMInfo`.
 
     **Raises:** `InputError` where a place is in two blocks or not in the vector, or a number is out of range. Haario et
     al. (2006); Algorithm 3.
     """
     given = jnp.asarray(covariance, dtype=float)
     sweep = Sweep(log_density, checked_blocks(blocks, len(given)), patience, shrinkage)
-    return SamplingAlgorithm(lambda position, rng_key=None: sweep.init(position, given), sweep.step)
+    return blackjax().base.SamplingAlgorithm(lambda position, rng_key=None: sweep.init(position, given), sweep.step)
 
 
 def checked_blocks(blocks: Sequence[Sequence[int]] | None, size: int) -> tuple[tuple[int, ...], ...]:

@@ -2,7 +2,7 @@
 
 A loop over time does little in each step, so that handing its kernels to a thread pool one after the other takes long:
 a trajectory's slopes cost 3.4 times the processor time on one thread of the diagnosis, 1.7 times on two. XLA reads
-its options once, when JAX first computes (which importing blackjax does), so this is imported before anything else;
+its options once, when JAX first computes, so this is imported before anything else;
 `XLA_FLAGS` that set such options already are left as they are.
 """
 

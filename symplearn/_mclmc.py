@@ -4,10 +4,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from blackjax.adaptation.step_size import dual_averaging_adaptation
-from blackjax.mcmc import adjusted_mclmc_dynamic
 from jaxtyping import Array, PRNGKeyArray
 
+from ._blackjax import blackjax
 from ._blocks import Course
 from ._chains import AbstractKernel, Plan, run_chains
 from ._errors import InputError
@@ -85,7 +84,9 @@ class _Trajectories(AbstractKernel):
 
     def begin(self, z):
         count, size = z.shape
-        places = jax.vmap(lambda z: adjusted_mclmc_dynamic.init(z, self._log_density, jnp.zeros((), int)))(z)
+        places = jax.vmap(
+            lambda z: blackjax().mcmc.adjusted_mclmc_dynamic.init(z, self._log_density, jnp.zeros((), int))
+        )(z)
         averaging = jax.tree.map(jnp.asarray, self._averaging[0](0.5 * size**0.5))
         return _State(places, averaging, jnp.zeros(count, bool), jnp.zeros(count), jnp.zeros((), int))
 
@@ -94,7 +95,7 @@ class _Trajectories(AbstractKernel):
         _, update, end = self._averaging
         warm = k < self.warm_up
         size = jnp.where(warm, jnp.exp(state.averaging.log_step_size), end(state.averaging))
-        kernel = adjusted_mclmc_dynamic.build_kernel(self._steps, next_random_arg_fn=lambda k: k + 1)
+        kernel = blackjax().mcmc.adjusted_mclmc_dynamic.build_kernel(self._steps, next_random_arg_fn=lambda k: k + 1)
         keys = jax.random.split(key, len(state.accepted))
         places, info = jax.vmap(lambda key, place: kernel(key, place, self._log_density, size))(keys, state.places)
         learnt = update(state.averaging, jnp.mean(info.acceptance_rate))
@@ -111,9 +112,11 @@ class _Trajectories(AbstractKernel):
 
     @property
     def _averaging(self):
-        return dual_averaging_adaptation(self.acceptance)
+        return blackjax().adaptation.step_size.dual_averaging_adaptation(self.acceptance)
 
     def _steps(self, k):
         """How many steps proposal `k` has: 1 to 2 length - 1, `length` on average, by van der Corput's sequence."""
         # blackjax's sequence has a zero in every 1024.
-        return jnp.maximum(adjusted_mclmc_dynamic.trajectory_length(k, float(self.length)), 1).astype(int)
+        return jnp.maximum(blackjax().mcmc.adjusted_mclmc_dynamic.trajectory_length(k, float(self.length)), 1).astype(
+            int
+        )

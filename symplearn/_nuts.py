@@ -2,14 +2,11 @@
 
 from typing import Any, NamedTuple
 
-import blackjax
 import jax
 import jax.numpy as jnp
-from blackjax.adaptation.mass_matrix import mass_matrix_adaptation
-from blackjax.adaptation.staged_adaptation import build_schedule
-from blackjax.adaptation.step_size import dual_averaging_adaptation
 from jaxtyping import Array, PRNGKeyArray
 
+from ._blackjax import blackjax
 from ._blocks import Course
 from ._chains import AbstractKernel, Plan, run_chains
 from ._errors import InputError
@@ -94,13 +91,13 @@ class _Trajectories(AbstractKernel):
         def one(z):
             averaging, mass = self._averaging[0](1.0), self._mass[0](z.shape[0])
             tuning = _Tuning(averaging, mass, jnp.ones(()), mass.inverse_mass_matrix)
-            place, none = blackjax.nuts.init(z, self._log_density), jnp.zeros(())
+            place, none = blackjax().nuts.init(z, self._log_density), jnp.zeros(())
             return _State(place, tuning, jnp.zeros((), bool), none, none, jnp.zeros((), int))
 
         return jax.vmap(one)(z)
 
     def step(self, state, k, key):
-        kernel, log_density = blackjax.nuts.build_kernel(), self._log_density
+        kernel, log_density = blackjax().nuts.build_kernel(), self._log_density
 
         def one(state, key):
             tuning = state.tuning
@@ -126,16 +123,16 @@ class _Trajectories(AbstractKernel):
 
     @property
     def _averaging(self):
-        return dual_averaging_adaptation(self.acceptance)
+        return blackjax().adaptation.step_size.dual_averaging_adaptation(self.acceptance)
 
     @property
     def _mass(self):
-        return mass_matrix_adaptation(is_diagonal_matrix=True)
+        return blackjax().adaptation.mass_matrix.mass_matrix_adaptation(is_diagonal_matrix=True)
 
     def _tuned(self, tuning, k, position, accepted):
         """Step `k` of Stan's windows, as `blackjax.window_adaptation` takes it, which runs only as a whole."""
         (begin, update, end), (_, learn, conclude) = self._averaging, self._mass
-        in_window, ends_window = build_schedule(self.warm_up)[k]
+        in_window, ends_window = blackjax().adaptation.staged_adaptation.build_schedule(self.warm_up)[k]
         averaging = update(tuning.averaging, accepted)
         mass = jax.lax.cond(in_window == 1, lambda: learn(tuning.mass, position), lambda: tuning.mass)
         averaging, mass = jax.lax.cond(

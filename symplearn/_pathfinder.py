@@ -8,11 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from blackjax.optimizers.lbfgs import bfgs_sample, lbfgs_inverse_hessian_formula_1
-from blackjax.vi import pathfinder
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy.special import logsumexp
 
+from ._blackjax import blackjax
 from ._blocks import Course, run_blocks
 from ._errors import InputError
 from ._importance import WeightedSample, densities, refuse_nothing, resampled
@@ -129,7 +128,7 @@ def _more(options, density, whitening, paths, key, count):
         begin_key, walk_key, elbo_key = jax.random.split(jax.random.fold_in(key, paths.done), 3)
         begin = options.reach * jax.random.normal(begin_key, whitening.centre.shape)
         limits = {"num_samples": 1, "maxiter": options.steps, **_LIMITS}
-        _, info = pathfinder.approximate(walk_key, log_density, begin, **limits)
+        _, info = blackjax().vi.pathfinder.approximate(walk_key, log_density, begin, **limits)
         elbo, mean, covariance = _best(log_density, info.path, elbo_key)
         at = paths.done
         return _Paths(
@@ -147,7 +146,7 @@ def _best(log_density, path, key):
     # path and its factors of the inverse Hessian are right: here they are scored again.
     def elbo(data):
         key, state = data
-        z, log_q = bfgs_sample(
+        z, log_q = blackjax().optimizers.lbfgs.bfgs_sample(
             key, _COMPARED, state.position, -state.grad_position, state.alpha, state.beta, state.gamma
         )
         return jnp.mean(jax.vmap(log_density)(z) - log_q)
@@ -155,5 +154,5 @@ def _best(log_density, path, key):
     elbos = jax.vmap(elbo)((jax.random.split(key, len(path.elbo)), path))
     best = jnp.argmax(jnp.where(jnp.isfinite(elbos), elbos, -jnp.inf))
     state = jax.tree.map(lambda one: one[best], path)
-    covariance = lbfgs_inverse_hessian_formula_1(state.alpha, state.beta, state.gamma)
+    covariance = blackjax().optimizers.lbfgs.lbfgs_inverse_hessian_formula_1(state.alpha, state.beta, state.gamma)
     return elbos[best], state.position - covariance @ state.grad_position, 0.5 * (covariance + covariance.T)

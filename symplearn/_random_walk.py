@@ -3,12 +3,11 @@
 import math
 from typing import Any, NamedTuple
 
-import blackjax
 import jax
 import jax.numpy as jnp
-from blackjax.mcmc.random_walk import normal as normal_step
 from jaxtyping import Array, PRNGKeyArray
 
+from ._blackjax import blackjax
 from ._blocks import Course
 from ._chains import AbstractKernel, Plan, run_chains
 from ._importance import AdaptiveImportance
@@ -91,4 +90,6 @@ class _Walk(AbstractKernel):
         return state.walk.position, state.walk.logdensity
 
     def _algorithm(self, scale):
-        return blackjax.additive_step_random_walk(whitened(self.density, self.whitening), normal_step(scale))
+        kernels = blackjax()
+        step = kernels.mcmc.random_walk.normal(scale)
+        return kernels.additive_step_random_walk(whitened(self.density, self.whitening), step)

@@ -3,17 +3,14 @@
 import math
 from typing import Any, NamedTuple
 
-import blackjax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from blackjax.smc.ess import log_ess
-from blackjax.smc.resampling import systematic
-from blackjax.smc.solver import dichotomy
 from jax.scipy.special import gammaln, logsumexp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from ._blackjax import blackjax
 from ._blocks import Course, run_blocks
 from ._errors import InputError
 from ._sampler import AbstractBlockSampler, Drawn, LogDensity, refuse_counts, whitened
@@ -201,7 +198,8 @@ def _advanced(options, log_density, particles, key):
         return jnp.where(possible, step * ratio, -jnp.inf)
 
     left = 1.0 - particles.power
-    step = dichotomy(lambda step: log_ess(log_weights(step)) - least, jnp.zeros(()), left)
+    smc = blackjax().smc
+    step = smc.solver.dichotomy(lambda step: smc.ess.log_ess(log_weights(step)) - least, jnp.zeros(()), left)
     weights = log_weights(step)
     total = logsumexp(weights)
     # The last step is exact, whatever rounding does to the sum.
@@ -215,8 +213,8 @@ def _moved(options, log_density, particles, power, weights, resample_key, move_k
     """Lines that start at resampled particles and walk at a power."""
     pool_key, line_key = jax.random.split(resample_key)
     # The steps' differences are of particles of the past power: a walk that looked at itself would not be reversible.
-    pool = particles.z[systematic(pool_key, weights, len(weights))]
-    rows = systematic(line_key, weights, options.lines)
+    pool = particles.z[blackjax().smc.resampling.systematic(pool_key, weights, len(weights))]
+    rows = blackjax().smc.resampling.systematic(line_key, weights, options.lines)
     size, scale = pool.shape[1], jnp.exp(particles.log_scale)
 
     def difference(key, _):
@@ -231,7 +229,7 @@ def _moved(options, log_density, particles, power, weights, resample_key, move_k
         height = log_density(z)
         return power * height + (1.0 - power) * _student(options, z)
 
-    kernel = blackjax.additive_step_random_walk(tempered, difference)
+    kernel = blackjax().additive_step_random_walk(tempered, difference)
 
     def walk(state, key):
         def once(state, key):
@@ -265,4 +263,4 @@ def _moved(options, log_density, particles, power, weights, resample_key, move_k
 
 def _walker(z: Array, height: Array) -> Any:
     """blackjax's state of a walk, of a density known already."""
-    return blackjax.mcmc.random_walk.RWState(z, height)
+    return blackjax().mcmc.random_walk.RWState(z, height)

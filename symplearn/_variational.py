@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from blackjax.vi import fullrank_vi, meanfield_vi
 from jaxtyping import Array, PRNGKeyArray
 
+from ._blackjax import blackjax
 from ._blocks import Course, run_blocks
 from ._errors import InputError
 from ._importance import WeightedSample, densities, refuse_nothing, resampled
@@ -43,7 +43,7 @@ class MeanField(AbstractFamily):
 
     @property
     def algorithm(self) -> ModuleType:
-        return meanfield_vi
+        return blackjax().vi.meanfield_vi
 
     def coordinates(self, start: Whitening) -> Whitening:
         # Scaled but not turned: turned coordinates would hide the correlations.
@@ -51,7 +51,7 @@ class MeanField(AbstractFamily):
         return Whitening(start.centre, jnp.diag(sd))
 
     def log_density(self, *numbers: Array) -> Callable[[Array], Array]:
-        return meanfield_vi.generate_meanfield_logdensity(*numbers)
+        return blackjax().vi.meanfield_vi.generate_meanfield_logdensity(*numbers)
 
 
 class FullRank(AbstractFamily):
@@ -59,13 +59,13 @@ class FullRank(AbstractFamily):
 
     @property
     def algorithm(self) -> ModuleType:
-        return fullrank_vi
+        return blackjax().vi.fullrank_vi
 
     def coordinates(self, start: Whitening) -> Whitening:
         return Whitening(start.centre, start.root)
 
     def log_density(self, *numbers: Array) -> Callable[[Array], Array]:
-        return fullrank_vi.generate_fullrank_logdensity(*numbers)
+        return blackjax().vi.fullrank_vi.generate_fullrank_logdensity(*numbers)
 
 
 class VariationalInference(AbstractBlockSampler):
