@@ -57,7 +57,8 @@ def _in_process(quick: bool, passage: str) -> dict[str, Any]:
     from ._contest import compiled
 
     by_size: dict[str, Any] = {}
-    for n in QUICK if quick else SIZES if passage == "parallel" else [n for n in SIZES if n <= LONGEST]:
+    most = LONGEST if passage == "sequential" and jax.default_backend() == "gpu" else max(SIZES)
+    for n in QUICK if quick else [n for n in SIZES if n <= most]:
         score, at = _oscillator(n, passage)
         gradient, value = compiled(jax.value_and_grad(score), *at), compiled(score, *at)
         found = [float(one) for one in gradient()]

@@ -110,7 +110,7 @@ def test_what_cannot_be_tempered_is_said():
     for wrong, sentence in (
         (lambda: TemperedSMC(keep=1.0), "`keep` between 0 and 1, but was given 1.0"),
         (lambda: TemperedSMC(reach=0.0), "`reach` and `dof` above 0, but was given 0.0"),
-        (lambda: TemperedSMC(runs=1), "`runs` of at least 2, but was given 1"),
+        (lambda: TemperedSMC(runs=1), "`runs` of at least 2, a whole number, but was given 1"),
     ):
         with pytest.raises(InputError, match=sentence):
             wrong()
