@@ -12,7 +12,7 @@ from importlib.metadata import version
 # Bytes of state up to which a loop becomes one function.
 _SMALL = 10_000_000
 # The option has this name in these versions of jaxlib; another would end the process at a name it does not know.
-_KNOWN = ("0.10.",)
+_KNOWN = ("0.10.", "0.11.")
 _OPTION = "--xla_backend_extra_options"
 
 
