@@ -24,8 +24,8 @@ def diagnose(file: SimulationFile, recordings: Sequence[Recording], options: Opt
     """Locate what differs between a simulation and its recordings, name what was left out, and show the fit without
     and with it.
 
-    It computes where JAX does, and is made for a processor: on a graphics card it takes more than four times as long. The
-    command line sees to that; here `jax.config.update("jax_platforms", "cpu")` does, before anything is computed.
+    It computes where JAX does, and is made for a processor: on a graphics card it takes more than four times as long.
+    The command line sees to that; here `jax.config.update("jax_platforms", "cpu")` does, before anything is computed.
 
     `InputError` where something else is given, as a path, or simulation and recordings do not fit together.
     """
