@@ -177,30 +177,37 @@ def scan(
     """
     lanes = list(packed(problem, units))
     nuisances: dict[int, Nuisance] = {}
-    tried: list[tuple[Response, Nuisance]] = []
+    tried: list[Response] = []
+    # Scores with unknowns of their own are taken at once, by their place among all: of many recordings those unknowns
+    # are matrices of megabytes.
+    own: dict[int, Score | None] = {}
     for group, by_unit in zip(lanes, grams(lanes), strict=True):
         for unit, by_recording in zip(group, by_unit, strict=True):
             for member in _members(problem, unit, combination):
                 others = nuisance(problem, by_recording, z, combination, priors, member, nuisances)
-                tried.append((response(problem, by_recording, unit, member), others))
+                tried.append(response(problem, by_recording, unit, member))
+                if others is not nuisances[0]:
+                    (own[len(tried) - 1],) = scores(problem, tried[-1:], z, priors, others)
     found: dict[int, list[Score]] = {}
-    for scored in _scored(problem, tried, z, priors):
+    for scored in _scored(problem, tried, own, z, priors, nuisances):
         found.setdefault(scored.member, []).append(scored)
     return [one.start(problem, z, combination)
             for member, listed in found.items() for one in _peaks(listed, problem.whole(member) in chosen)]  # fmt: skip
 
 
 def _scored(
-    problem: Problem, tried: Sequence[tuple[Response, Nuisance]], z: Float[np.ndarray, " z"], priors: Priors
-) -> list[Score]:
-    """Scores in the order of the responses, like ones together."""
-    alike: dict[tuple[int, int, bool], list[int]] = {}
-    for k, (told, others) in enumerate(tried):
-        effect = problem.candidate(told.member).effect
-        alike.setdefault((id(others), effect.amplitudes, effect.positive), []).append(k)
-    found: dict[int, Score | None] = {}
+    problem: Problem, tried: Sequence[Response], own: dict[int, Score | None], z: Float[np.ndarray, " z"],
+    priors: Priors, nuisances: dict[int, Nuisance],
+) -> list[Score]:  # fmt: skip
+    """Scores in the order of the responses, like ones together; some are known."""
+    alike: dict[tuple[int, bool], list[int]] = {}
+    for k, told in enumerate(tried):
+        if k not in own:
+            effect = problem.candidate(told.member).effect
+            alike.setdefault((effect.amplitudes, effect.positive), []).append(k)
+    found = dict(own)
     for some in alike.values():
-        found |= zip(some, scores(problem, [tried[k][0] for k in some], z, priors, tried[some[0]][1]), strict=True)
+        found |= zip(some, scores(problem, [tried[k] for k in some], z, priors, nuisances[0]), strict=True)
     return [one for k in range(len(tried)) if (one := found[k]) is not None]
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .. import _effects as effects
+from ._arrow import LEAST, MANY, Arrow
 from ._calibrate import Priors
 from ._problem import Combination, Problem
 from ._strength import mixture_gains
@@ -42,12 +43,13 @@ class Nuisance(NamedTuple):
     vector: Float[np.ndarray, " active"]
     step: Float[np.ndarray, " active"]  # to that best
     bounds: tuple[np.ndarray, np.ndarray]  # of every entry of z
+    spread: float  # the logarithm of the inverse's determinant
     gain: float = 0.0  # of an unseen start, under the widest prior
 
     @property
     def earned(self) -> float:
         """Log evidence of these unknowns, but for the density of their priors."""
-        return float(0.5 * self.vector @ self.step + 0.5 * np.linalg.slogdet(self.inverse)[1])
+        return float(0.5 * self.vector @ self.step + 0.5 * self.spread)
 
 
 def nuisance(
@@ -74,19 +76,35 @@ def _remaining(
     unseen: int | None = None,
 ) -> Nuisance:  # fmt: skip
     """All unknowns of a combination, and the start of what one further member adds `unseen`."""
-    size = problem.size
     active, precision = problem.active(combination), priors.precision_of(problem, combination)
     if unseen is not None:
         starts = _starts(problem, unseen)
         active[starts] = True
         precision[starts] = priors.precision_of(problem, (unseen,))[starts]
+    found, spread, push = _inverted(problem, by_recording, precision, active)
+    vector = push - precision * (z - priors.mean_of(problem, combination))
+    bounds = priors.bounds_of(problem, combination)
+    return Nuisance(active, found, vector[active], found @ vector[active], bounds, spread)
+
+
+def _inverted(
+    problem: Problem, by_recording: Sequence[np.ndarray], precision: Float[np.ndarray, " z"],
+    active: Bool[np.ndarray, " z"],
+) -> tuple[Float[np.ndarray, "active active"], float, Float[np.ndarray, " z"]]:  # fmt: skip
+    """The inverse of all information on what is active, the logarithm of its determinant, and what the error pushes."""
+    size, state, count = problem.size, problem.state, len(by_recording)
+    local = 1 + state + size - problem.head
+    if count >= MANY:
+        grams = np.stack([own[:local, :local] for own in by_recording])
+        push = np.concatenate([grams[:, 0, 1 : 1 + state].ravel(), grams[:, 0, 1 + state :].sum(0)])
+        found, spread = Arrow.of(grams[:, 1:, 1:], state).held(precision, active).inverse()
+        return found[np.ix_(active, active)], spread, push
     gram = np.zeros((1 + size, 1 + size))
     for r, own in enumerate(by_recording):
         place = np.concatenate([[0], 1 + problem.local(r)])
-        gram[np.ix_(place, place)] += own[: len(place), : len(place)]
-    vector = gram[0, 1:] - precision * (z - priors.mean_of(problem, combination))
+        gram[np.ix_(place, place)] += own[:local, :local]
     found = inverse(gram[1:, 1:][np.ix_(active, active)] + np.diag(precision[active]))
-    return Nuisance(active, found, vector[active], found @ vector[active], priors.bounds_of(problem, combination))
+    return found, float(np.linalg.slogdet(found)[1]), gram[0, 1:]
 
 
 def inverse(matrix: Float[np.ndarray, "*lane n n"]) -> Float[np.ndarray, "*lane n n"]:
@@ -97,7 +115,7 @@ def inverse(matrix: Float[np.ndarray, "*lane n n"]) -> Float[np.ndarray, "*lane 
         scaled = matrix / shape
         sound = np.isfinite(scaled).all((-2, -1))[..., None, None]
         values, vectors = np.linalg.eigh(np.where(sound, scaled, np.eye(matrix.shape[-1])))
-        found = (vectors / np.maximum(values, 1e-13)[..., None, :]) @ vectors.mT / shape
+        found = (vectors / np.maximum(values, LEAST)[..., None, :]) @ vectors.mT / shape
         return np.where(sound, found, np.nan)
 
 
@@ -113,14 +131,13 @@ class Response(NamedTuple):
 
 def response(problem: Problem, by_recording: Sequence[np.ndarray], unit: Unit, member: int) -> Response:
     """From the Gram matrices of a unit's columns."""
-    number = problem.candidate(member).effect.amplitudes
-    cross, square, vector = np.zeros((problem.size, number)), np.zeros((number, number)), np.zeros(number)
-    for r in problem.members[member].recordings:
-        own, gram = problem.local(r), by_recording[r]
-        k = 1 + len(own)
-        cross[own] += gram[1:k, k:]
-        square, vector = square + gram[k:, k:], vector + gram[0, k:]
-    return Response(unit, member, cross, square, vector)
+    number, some = problem.candidate(member).effect.amplitudes, list(problem.members[member].recordings)
+    state, local = problem.state, 1 + problem.state + problem.size - problem.head
+    grams = np.stack([by_recording[r] for r in some])
+    cross = np.zeros((problem.size, number))
+    cross[: problem.head].reshape(-1, state, number)[some] = grams[:, 1 : 1 + state, local:]
+    cross[problem.head :] = grams[:, 1 + state : local, local:].sum(0)
+    return Response(unit, member, cross, grams[:, local:, local:].sum(0), grams[:, 0, local:].sum(0))
 
 
 class Score(NamedTuple):

@@ -13,7 +13,7 @@ nothing at zero (the moment prior of Johnson and Rossell 2010): what is not need
 import itertools
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.special import log_ndtr, logsumexp
 from scipy.stats import norm
 
@@ -39,6 +39,8 @@ _REACH, _POINTS = 5.0, 121
 _SILENT = 1e-9
 # Of a correlation matrix.
 _ROUND_OFF = 1e-13
+# Entries of one effect from which on matrices are not inverted: the starts of an unseen oscillator in many recordings.
+_MANY = 16
 
 
 def strength_gain(
@@ -129,24 +131,38 @@ def mixture_gains(
     spread = np.where(sound[:, None, None], spread, 0.5 * np.eye(a))
     values, vectors = np.linalg.eigh(spread)
     left = np.maximum(1.0 - values, _SILENT)  # what the recording says, as a share of all that is known
-    likelihood = (vectors * (np.maximum(values, 1e-300) / left)[:, None]) @ vectors.mT  # covariance without the priors
+    bare = np.maximum(values, 1e-300) / left  # of the covariance without the priors
     along = np.einsum("lij,li->lj", vectors, np.where(sound[:, None], centre, 0.0))
+    if effects == 1 and a > _MANY:
+        widths = np.concatenate([_shares(values, alone), np.ones((len(centre), 1))], axis=1)
+        logs, squares = _log_weights_of_one(vectors, bare, along / left, widths, lowest)
+        return _gains(logs, squares, own, alone, sound)
+    likelihood = (vectors * bare[:, None]) @ vectors.mT
     told = np.einsum("lij,lj->li", vectors, along / left)
-    shares = np.stack([_shares(spread[:, own == k][:, :, own == k], alone) for k in range(effects)], axis=1)
+    parts = [np.linalg.eigvalsh(spread[:, own == k][:, :, own == k]) for k in range(effects)]
+    shares = np.stack([_shares(part, alone) for part in parts], axis=1)
     choices = np.array(list(itertools.product(range(shares.shape[-1]), repeat=effects)))
     widths = shares[:, np.arange(effects), choices][..., own]
     # The widest priors last, whose effects may be too weak to be seen.
     every = np.concatenate([widths, np.ones((len(centre), 1, a))], axis=1)
     logs, squares = _log_weights(told, likelihood, every, lowest)
+    return _gains(logs, squares, own, alone, sound)
+
+
+def _gains(
+    logs: Float[np.ndarray, "lane choice"], squares: Float[np.ndarray, "lane choice a"], own: np.ndarray, alone: bool,
+    sound: Bool[np.ndarray, " lane"],
+) -> Float[np.ndarray, " lane"]:  # fmt: skip
+    """What all choices of widths gain over the widest, which is the last."""
     if not alone:
-        logs[:, :-1] += sum(np.log(squares[:, :-1, own == k].mean(-1)) for k in range(effects))
-    gains = np.logaddexp.reduce(logs[:, :-1], axis=1) - np.log(len(choices)) - logs[:, -1]
+        logs[:, :-1] += sum(np.log(squares[:, :-1, own == k].mean(-1)) for k in range(int(own[-1]) + 1))
+    gains = np.logaddexp.reduce(logs[:, :-1], axis=1) - np.log(logs.shape[1] - 1) - logs[:, -1]
     return np.where(sound & np.isfinite(gains), gains, 0.0)
 
 
-def _shares(spread: Float[np.ndarray, "lane b b"], alone: bool) -> Float[np.ndarray, "lane width"]:
-    """Widths of one effect's prior, in that of the widest."""
-    values = np.clip(np.linalg.eigvalsh(spread), 1e-300, None)
+def _shares(values: Float[np.ndarray, "lane b"], alone: bool) -> Float[np.ndarray, "lane width"]:
+    """Widths of one effect's prior, in that of the widest, by the eigenvalues of what is known of it."""
+    values = np.clip(values, 1e-300, None)
     information = np.mean(np.maximum(1.0 / values - 1.0, 0.0), axis=-1)
     return _widths(_SEEN / np.sqrt(np.maximum(information, 1e-300)), alone)
 
@@ -188,6 +204,26 @@ def _log_weights(
         out += orthants(centre[..., some] - lowest[some], covariance[..., some, :][..., some])
         out -= log_ndtr(-lowest[some] / widths[..., some]).sum(-1)
     return out, _square(centre, _diagonal(covariance), lowest) / _square(np.zeros_like(centre), prior, lowest)
+
+
+def _log_weights_of_one(
+    vectors: Float[np.ndarray, "lane a a"], values: Float[np.ndarray, "lane a"], told: Float[np.ndarray, "lane a"],
+    widths: Float[np.ndarray, "lane choice"], lowest: Float[np.ndarray, " a"],
+) -> tuple[Float[np.ndarray, "lane choice"], Float[np.ndarray, "lane choice a"]]:  # fmt: skip
+    """The same where all entries are one effect's, of one width: in the axes of the likelihood's covariance, for which
+    no matrix is inverted. `told` is along these."""
+    prior = widths[..., None] ** 2
+    total = values[:, None] + prior
+    out = -0.5 * (told[:, None] ** 2 / total + np.log(total)).sum(-1)
+    centre = np.einsum("lij,lcj->lci", vectors, prior * told[:, None] / total)
+    along, some = prior * values[:, None] / total, np.isfinite(lowest)
+    if some.any():
+        covariance = np.einsum("lij,lcj,lkj->lcik", vectors[:, some], along, vectors[:, some])
+        out += orthants(centre[..., some] - lowest[some], covariance)
+        out -= log_ndtr(-lowest[some] / widths[..., None]).sum(-1)
+    variance = np.einsum("lij,lcj->lci", vectors**2, along)
+    whole = np.broadcast_to(prior, centre.shape)
+    return out, _square(centre, variance, lowest) / _square(np.zeros_like(centre), whole, lowest)
 
 
 def _square(centre: np.ndarray, variance: np.ndarray, lowest: np.ndarray) -> np.ndarray:
