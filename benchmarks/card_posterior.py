@@ -13,7 +13,7 @@ from ._card import elsewhere, told
 from ._figures import seconds_told
 from ._row import Effort, Line
 
-# Chains on the card, in a quick run, and on the processor; steps, every tenth of which is kept.
+# Chains on the card, in a quick run, and on the processor; steps, every hundredth of which is kept.
 CHAINS, QUICK, BESIDE = 10_000, 64, 64
 STEPS, THIN, QUICK_STEPS = 2_000, 100, 400
 

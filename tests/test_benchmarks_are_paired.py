@@ -3,12 +3,15 @@
 import json
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import _command, _results
+from benchmarks import _command, _results, _row
 from benchmarks._contest import Check, Contender, Spread, contest, paired_ratios, timed
 from benchmarks._figures import growth, ratio_line
+from benchmarks._operations import bytes_of_products, operations
 from benchmarks._row import Disagreement, Effort, Line, Row
 from benchmarks._rows import ROWS
 from benchmarks._table import placed
@@ -172,3 +175,26 @@ def test_rows_are_listed(capsys):
     listed = capsys.readouterr().out
     for row in ROWS:
         assert f"{row.name} " in listed and row.about in listed and (ROOT / "benchmarks" / f"{row.name}.py").exists()
+
+
+def test_rows_of_a_card_are_left_out_where_there_is_none(monkeypatch):
+    """Without a graphics card its rows are not among all rows; named, each says what it needs."""
+    monkeypatch.setattr(_row, "card", lambda: None)
+    monkeypatch.setattr(_command, "card", lambda: None)
+    assert not any(row.on_card for row in _command._chosen([]))
+    (row,) = _command._chosen(["card_chains"])
+    assert row.missing == ["a graphics card that JAX computes on"]
+    monkeypatch.setattr(_command, "card", lambda: "a card")
+    assert _command._chosen([]) == list(ROWS)
+
+
+def test_bytes_of_products_are_those_of_their_arrays():
+    """A product of matrices of 3 x 4 and 4 x 5 doubles moves 12 + 20 + 15 numbers, in seven steps seven times."""
+    a, b = np.ones((3, 4)), np.ones((4, 5))
+
+    def steps(a, b):
+        return jax.lax.scan(lambda c, _: (c + jnp.sum(jnp.sin(a) @ b), None), 0.0, length=7)[0]
+
+    assert bytes_of_products(steps, a, b) == 7 * 8 * (12 + 20 + 15)
+    # Of each product 2 x 4 - 1 operations for 15 numbers, their sum and one addition; 12 sines.
+    assert operations(steps, a, b) == 7 * (15 * 7 + 14 + 1 + 12)
