@@ -51,7 +51,7 @@ def test_what_is_switched_off_is_not_there(effect, target, values):
 
 @pytest.mark.parametrize(
     ("given", "jaxlib", "asked"),
-    [("", "0.10.2", True), ("--xla_cpu_max_isa=AVX2", "0.10.2", True), ("", "0.11.0", False),
+    [("", "0.10.2", True), ("--xla_cpu_max_isa=AVX2", "0.10.2", True), ("", "0.11.0", True), ("", "0.12.0", False),
      ("--xla_backend_extra_options=mine", "0.10.2", False)],
 )  # fmt: skip
 def test_the_users_own_flags_stay(monkeypatch, given, jaxlib, asked):
