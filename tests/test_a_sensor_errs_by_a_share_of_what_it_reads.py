@@ -40,7 +40,7 @@ def test_faults_of_a_sensor_are_as_strong_as_each_other():
     errors = {"sensor_bias": np.ones_like(TIMES), "sensor_drift": TIMES, "sensor_gain": PATH[:, 0]}
     for name, error in errors.items():
         width = w.found.priors.scales[w.problem.candidate(member(w.problem, name)).first]
-        # A sum over 300 rows is an integral over the time to about one in 300.
+        # The prior takes a drift's rms as an integral over the time; a sum over 300 rows is that to one in 300, 0.0033.
         assert width * np.sqrt(np.mean(error**2)) == pytest.approx(0.3 * np.sqrt(np.mean(PATH[:, 0] ** 2)), rel=0.005)
 
 

@@ -37,10 +37,12 @@ def test_blocks_are_inverted_as_the_whole(seed):
     inverse, log_determinant = Arrow.of(grams, STATE).held(precision, active).inverse()
     expected = np.linalg.inv((assembled(grams) + np.diag(precision))[np.ix_(active, active)])
     scale = np.sqrt(np.diag(expected))
-    # Columns differ by 1e6; in units of each one's error the matrix has a condition of some thousands.
+    # In units of each one's error the two differ by 5e-14 at most: round-off of NumPy's inverse, whose matrix has a
+    # condition of up to 6e9. A block in the wrong place is an error of order one.
     np.testing.assert_allclose(
         inverse[np.ix_(active, active)] / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-10
     )
+    # A sum of some thirty logarithms: round-off, 2e-16 here, and what that of the inverse leaves in its determinant.
     assert log_determinant == pytest.approx(np.linalg.slogdet(expected)[1], rel=1e-10)
 
 
@@ -75,6 +77,7 @@ def test_the_strength_of_many_starts_needs_no_inverse(alone, monkeypatch):
     lowest, own = np.append(0.0, np.full(a - 1, -np.inf)), np.zeros(a, int)
     found = mixture_gains(centre, spread, own, lowest, alone)
     monkeypatch.setattr(_strength, "_MANY", a)
+    # By inverses correlations have 1e-13 added to their diagonal, `_ROUND_OFF`: up to 1e-11 of gains of some hundred.
     np.testing.assert_allclose(found, mixture_gains(centre, spread, own, lowest, alone), rtol=1e-10)
 
 
@@ -92,5 +95,6 @@ def test_a_scan_of_many_recordings_is_that_of_the_whole(monkeypatch):
     precision = np.random.default_rng(1).uniform(0.1, 10.0, p.size)
     blocks = _score._inverted(p, grams, precision, active)
     monkeypatch.setattr(_score, "MANY", COUNT + 1)
+    # Round-off of two ways to invert a matrix whose columns are alike in size; entries that are zero are so to 1e-12.
     for one, other in zip(blocks, _score._inverted(p, grams, precision, active), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
