@@ -13,7 +13,7 @@ _ARITHMETIC = set(
     """add add_any sub mul div neg abs sqrt rsqrt square integer_pow exp log sin cos tanh logistic pow max min
     log1p one_minus_square""".split()
 )
-_LOOPS = {"scan", "loop_of_lanes"}
+_LOOPS = {"scan", "loop_of_lanes", "loop_of_many_lanes"}
 _SUMS = {"reduce_sum", "reduce_max", "reduce_min", "reduce_prod"}
 _FREE = set(
     """broadcast_in_dim reshape transpose concatenate slice dynamic_slice squeeze select_n iota eq ne lt le gt ge and or
@@ -48,7 +48,10 @@ def _within(equation, cost) -> int:
     if not inner:
         return cost(equation)
     bodies = [_count(part.jaxpr if isinstance(part, ClosedJaxpr) else part, cost) for part in inner]
-    return equation.params.get("length", 1) * sum(bodies) if equation.primitive.name in _LOOPS else max(bodies)
+    if equation.primitive.name not in _LOOPS:
+        return max(bodies)
+    # Machine code of many lanes holds the function of one.
+    return equation.params["length"] * equation.params.get("lanes", 1) * sum(bodies)
 
 
 def _cost(equation) -> int:

@@ -15,6 +15,7 @@ from benchmarks._operations import bytes_of_products, operations
 from benchmarks._row import Disagreement, Effort, Line, Row
 from benchmarks._rows import ROWS
 from benchmarks._table import placed
+from symplearn._lane_loops import with_lane_loops
 
 ROOT = Path(__file__).parents[1]
 
@@ -186,6 +187,15 @@ def test_rows_of_a_card_are_left_out_where_there_is_none(monkeypatch):
     assert row.missing == ["a graphics card that JAX computes on"]
     monkeypatch.setattr(_command, "card", lambda: "a card")
     assert _command._chosen([]) == list(ROWS)
+
+
+def test_a_loop_of_many_lanes_counts_for_all_of_them():
+    """Of sixteen lanes of machine code, of seven steps with one product each, there are 112 products."""
+
+    def steps(x):
+        return jax.lax.scan(lambda c, _: (c * x, None), x, length=7)[0]
+
+    assert operations(jax.vmap(with_lane_loops(steps)), np.ones(16)) == 16 * 7
 
 
 def test_bytes_of_products_are_those_of_their_arrays():
