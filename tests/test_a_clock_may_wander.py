@@ -91,6 +91,10 @@ def test_amplitudes_tell_laws_apart_beside_a_wandering_clock():
     clock = found.of(laws[0], "clock")
     assert found.shown(laws[0], clock) is found.of(laws[0], "coloured")
     assert found.told(laws[0], clock) is clock
+    # One that did not converge runs nowhere, whatever its evidence.
+    lost = replace(found.of(laws[0], "coloured"), converged=False)
+    found.estimates[laws[0]] = [lost if one.kind == "coloured" else one for one in found.estimates[laws[0]]]
+    assert found.shown(laws[0], clock) is found.of(laws[0], "white")
 
 
 def test_a_clock_that_keeps_time_explains_nothing():

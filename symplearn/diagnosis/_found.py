@@ -152,8 +152,9 @@ class Found:
 
     def shown(self, combination: Combination, best: Estimate) -> Estimate:
         """The estimate to run on: the one that is told, as far as its signs and bounds allow. But a clock that may
-        wander excuses the phase, which a run goes on from; there the best of the others."""
+        wander excuses the phase, which a run goes on from; there the best of the others, of which the evidence of one
+        that did not converge says nothing, however large."""
         told = self.told(combination, best)
-        others = [one for one in self.estimates[combination] if one.kind != told.kind]
+        others = [one for one in self.estimates[combination] if one.kind != told.kind and one.converged]
         run_on = speaker(others) if told.kind == "clock" and others else told
         return within_bounds(self.problem, self.priors, run_on)

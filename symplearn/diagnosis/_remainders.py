@@ -1,6 +1,6 @@
 """The best combinations again, beside remainders that are not weighed for all of them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -12,9 +12,10 @@ from ._weigher import KEPT, Weigher
 _REACH = 30.0
 # Of each size, combinations whose clock may wander, however far behind.
 _SIMPLE = 2
-# Combinations beside a force that goes with place: the best, of each size however far behind, and how many more where
-# it explains more than this many nats.
-_BEST, _STATIC, _LATER, _WORTH = 24, 8, 64, 2.0
+# Combinations beside a force that goes with place: the best, and of each size however far behind. How many more are
+# tried beside it, and beside a clock, where that explains more than this many nats.
+_BEST, _STATIC = 24, 8
+_LATER, _CLOCKS, _WORTH = 64, 16, 2.0
 
 
 class Remainders:
@@ -35,7 +36,10 @@ class Remainders:
             self.progress("weighing errors of the clock")
             near = [c for c in ranked if self.found.best(c) > top - _REACH][:KEPT]
             # What a clock excuses may be all that a larger one has ahead of the best of its size.
-            self.weigher.weigh_clocks(list(dict.fromkeys([*near, self.weigher.base, *self._of_each_size(_SIMPLE)])))
+            first = list(dict.fromkeys([*near, self.weigher.base, *self._of_each_size(_SIMPLE)]))
+            before = {c: self.found.odds(c) for c in ranked}
+            self.weigher.weigh_clocks(first)
+            self.weigher.weigh_clocks(self._lifted(first, before, "clock")[:_CLOCKS])
 
     def weigh_static(self) -> None:
         """The best combinations again beside a force that goes with place, which any of their forces may stand for; not
@@ -46,14 +50,18 @@ class Remainders:
         near = [c for c in ranked if self.found.odds(c) > top - _REACH][:_BEST]
         first = [c for c in dict.fromkeys([*near, self.weigher.base, *self._of_each_size(_STATIC)]) if c]
         self.weigher.weigh_static(first)
-        if later := self._lifted(first, [c for c in ranked if c and c not in first])[:_LATER]:
+        white = {c: self._odds(c, "white") for c in ranked if c}
+        if later := self._lifted(first, white, "static")[:_LATER]:
             self.weigher.weigh_static(later)
 
-    def _lifted(self, first: Sequence[Combination], others: Sequence[Combination]) -> list[Combination]:
-        """Those that would come near the best if a force that goes with place gave them as much as any of the first."""
-        gains = [self._odds(c, "static") - self._odds(c, "white") for c in first]
+    def _lifted(
+        self, first: Sequence[Combination], before: Mapping[Combination, float], kind: str
+    ) -> list[Combination]:
+        """Those but the first that would come near the best if a kind of remainder gave them as much as any of these,
+        of the odds that they had before."""
+        gains = [self._odds(c, kind) - before[c] for c in first if c in before]
         top, most = max(map(self.found.odds, first)), max((g for g in gains if np.isfinite(g)), default=0.0)
-        return [c for c in others if most > _WORTH and self._odds(c, "white") + most > top - _WORTH]
+        return [c for c in before if c not in first and most > _WORTH and before[c] + most > top - _WORTH]
 
     def _odds(self, combination: Combination, kind: str) -> float:
         """The same as `Found.odds` under one kind of remainder; NaN where it was not weighed."""
