@@ -15,11 +15,14 @@ from symplearn.diagnosis._weighed import weigh_coloured, weigh_white
 
 TIMES = np.linspace(0.0, 80.0, 500)
 ROWS = [len(TIMES)]
+# Later than the last of the parts that are fitted.
+CHANGE = 74.0
 
 
-def found_in(remainder):
-    """A spring with quadratic drag, weighed with nothing, with a damping and with the drag."""
-    rates = lambda t, x: [x[1], -x[0] - 0.02 * np.abs(x[1]) * x[1]]  # noqa: E731
+def found_in(remainder, stiffer=0.0):
+    """A spring with quadratic drag, from `CHANGE` on `stiffer` by a share, weighed with nothing, with a damping, and
+    with the drag; and with that change, too, where there is one."""
+    rates = lambda t, x: [x[1], -(1 + stiffer * (t > CHANGE)) * x[0] - 0.02 * np.abs(x[1]) * x[1]]  # noqa: E731
     y = cases.solved(rates, [1.0, 0.0], TIMES)[:, 0] + 0.005 * np.random.default_rng(1).normal(size=len(TIMES))
     more = "[parameters]\nk = { value = 1.0, sd = 0.1 }\n"
     p = cases.problem(cases.simulation("p**2/2 + k*q**2/2", more=more), [cases.recorded(TIMES, y + remainder)], 0.1)
@@ -27,9 +30,17 @@ def found_in(remainder):
     priors = replace(bare, scales=np.full(p.equations.size, 0.3), precision=np.full(p.size, 1e-2))
     names = [p.candidate(m).effect.name for m in p.searched]
     combinations = [(), *((p.searched[names.index(name)],) for name in ("viscous_damping", "quadratic_drag"))]
-    begin = np.zeros((3, p.size))
+    if stiffer:
+        change = p.searched[names.index("regime_change")]
+        combinations.append(tuple(sorted((*combinations[2], change))))
+    begin = np.zeros((len(combinations), p.size))
     begin[:, [0, p.head]] = 1.0
-    begin[1:, p.slots] = 0.01, 0.02
+    begin[1:3, p.slots] = 0.01, 0.02
+    if stiffer:
+        values = dict(p.placed(combinations[3]))
+        begin[3, values[combinations[2][0]]], begin[3, values[change]] = 0.02, (stiffer, CHANGE)
+        when = p.candidate(change).values.stop - 1
+        priors.centres[when], priors.scales[when] = CHANGE, 10.0
     stepper, found = Stepper(p), Found(p, priors)
     fits = calibrate(stepper, begin, combinations, priors, ROWS)
     for estimate in weigh_white(p, fits, priors, ROWS) + weigh_coloured(p, fits, priors, ROWS):
@@ -38,10 +49,13 @@ def found_in(remainder):
     return found, combinations
 
 
+# An error of the sensor that swings slowly, by three times its noise.
+SLOW = 0.01 * np.sin(0.37 * TIMES + 0.5) * np.cos(0.05 * TIMES)
+
+
 @pytest.fixture(scope="module")
 def clear():
-    """With an error of the sensor that swings slowly, by three times its noise."""
-    return found_in(0.01 * np.sin(0.37 * TIMES + 0.5) * np.cos(0.05 * TIMES))
+    return found_in(SLOW)
 
 
 def test_what_predicts_is_ahead(clear):
@@ -72,3 +86,14 @@ def test_white_noise_needs_no_second_look():
     found, (*_, drag) = found_in(0.0)
     assert found.ahead == {}
     assert found.shown(drag, found.of(drag, "coloured")).kind == "coloured"
+
+
+def test_nothing_foretells_what_happens_later():
+    """A change that the whole recording shows, after all parts that are fitted, is not used to predict it: the law with
+    it is no further ahead than the best without, which the change sets back."""
+    found, (_, damping, drag, both) = found_in(SLOW, stiffer=0.03)
+    white = {c: found.of(c, "white") for c in (drag, both)}
+    assert white[both].log_evidence > white[drag].log_evidence + 20.0
+    # At each of the three parts it counts as the best there: of two laws that take turns, a little more than either.
+    assert max(found.ahead[drag].score, found.ahead[damping].score) == pytest.approx(found.ahead[both].score, abs=0.1)
+    assert found.ahead[both].holds

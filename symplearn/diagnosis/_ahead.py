@@ -3,6 +3,7 @@
 Evidence then rests on a guess of what the remainder is, and Bayes factors of wrong models mislead. Every combination is
 fitted to the first part of the rows as a plain trajectory, and run on over the others (Buerkner, Gabry and Vehtari
 2020). Errors ahead are of one piece, an amplitude and a phase that drift away, so each free run counts as two readings.
+What happens at one time no earlier part can foretell, nor can it without: there it counts as the best of the others.
 """
 
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from jaxtyping import Float
 from .._effects import IMPULSE, REGIME
 from ._calibrate import calibrate, residuals, weights
 from ._found import Ahead, Found
-from ._problem import Combination
+from ._problem import Combination, Problem
 from ._trajectory import Stepper
 
 # Nats by which a remainder stands above white noise, by which an answer may lie behind the best to be looked at, and
@@ -27,6 +28,8 @@ _ORIGINS, _STEPS, _READINGS = (0.4, 0.6, 0.8), 20, 2.0
 _BETTER = 2.0
 # A trajectory fit that errs no more ahead than this many times as much as where it was fitted holds on.
 _HOLDS = 3.0
+# Share of the fitted rows that what happens at one time has to happen before, to be known from them.
+_KNOWN = 0.9
 
 
 def look_ahead(stepper: Stepper, found: Found, rows: Sequence[int]) -> None:
@@ -47,20 +50,31 @@ def _scores(
 ) -> dict[Combination, Ahead]:
     begin = np.stack([white.z for c in combinations if (white := found.of(c, "white"))])
     total, holds = np.zeros(len(begin)), np.ones(len(begin), bool)
-    # Of what happens at one time the first part may know nothing, so its values are those of the whole.
-    once = np.array([any(stepper.problem.candidate(m).effect in (IMPULSE, REGIME) for m in c) for c in combinations])
     for share in _ORIGINS:
         first = [max(1, round(n * share)) for n in rows]
-        fits = calibrate(stepper, begin, combinations, found.priors, first, _STEPS, held=once)
+        later = np.array([_is_later(stepper.problem, z, c, first) for z, c in zip(begin, combinations, strict=True)])
+        fits = calibrate(stepper, begin, combinations, found.priors, first, _STEPS, held=later)
         inside, ahead = _squares(stepper, fits.z, combinations, rows, first)
-        total -= 0.5 * _READINGS * np.log(ahead).sum(1)
-        holds &= (ahead < _HOLDS**2 * inside).all(1)
+        value = -0.5 * _READINGS * np.log(ahead).sum(1)
+        others = value[~later & np.isfinite(value)]
+        total += np.where(later, others.max() if others.size else 0.0, value)
+        holds &= later | (ahead < _HOLDS**2 * inside).all(1)
     total = np.where(np.isfinite(total), total, -np.inf)
     if not np.isfinite(total.max()):
         return {}
     bare = total[combinations.index(())] if () in combinations else -np.inf
     better, score = total > bare + _BETTER, np.maximum(total - total.max(), -_WORST)
     return {c: Ahead(float(s), bool(h), bool(b)) for c, s, h, b in zip(combinations, score, holds, better, strict=True)}
+
+
+def _is_later(problem: Problem, z: np.ndarray, combination: Combination, first: Sequence[int]) -> bool:
+    """Whether something of a combination happens at one time, and the first rows end before it or soon after."""
+    for m, place in problem.placed(combination):
+        if problem.candidate(m).effect in (IMPULSE, REGIME):
+            seen = [problem.rows[r].times[round(_KNOWN * (first[r] - 1))] for r in problem.members[m].recordings]
+            if z[place.stop - 1] > min(seen):
+                return True
+    return False
 
 
 def _squares(
