@@ -11,6 +11,7 @@ from .._simulation_records import SimulationFile
 from ._ahead import look_ahead
 from ._build import augmented_equations, build, first_substep, refined, rows_fitted
 from ._found import Found, doubtful_outliers, speaker
+from ._lasting import total_noise
 from ._locate import strained_coordinates
 from ._null_paths import rough_noise
 from ._options import Options
@@ -61,7 +62,8 @@ def searched(
     found = search.found
     best = max((e for es in found.estimates.values() for e in es), key=lambda e: e.log_evidence)
     if np.isfinite(best.log_evidence):
-        finer, _, is_fine = refined(rebuild, finer, best.z, best.reading_noise, substep, best.combination)
+        # What lasts among the errors hides steps of some length, too: without it they would be no end too long.
+        finer, _, is_fine = refined(rebuild, finer, best.z, total_noise(best), substep, best.combination)
         if finer is not stepper.problem:
             options.progress("weighing the best combinations again in finer steps")
             found = search.again(Stepper(finer, options.jobs))
