@@ -127,7 +127,7 @@ class Answer:
             equation_before=equation_lines(*lines, []),
             equation_after=equation_lines(*lines, chosen),
             series=tuple(self._series(r) for r in range(len(self.recordings))),
-            augmented=augmented(f, self.problem, self.after, values, self.expressions),
+            augmented=augmented(f, self.problem, self.found.priors, self.after, values, self.expressions),
             forecast=self.forecast,
         )
 
@@ -168,8 +168,8 @@ class Answer:
             "other": other,
             "family_probability": document.family_probability(self.problem, p),
             "parameters": {
-                "before": document.parameters(self.problem, self.before, spread),
-                "after": document.parameters(self.problem, self.after, spread),
+                "before": document.parameters(self.problem, self.found.priors, self.before, spread),
+                "after": document.parameters(self.problem, self.found.priors, self.after, spread),
             },
             "fit": {"before": before, "after": after},
             "next_measurement": self._next(),

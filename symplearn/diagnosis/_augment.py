@@ -8,6 +8,8 @@ import numpy as np
 from .._effects import EFFECTS
 from .._expression import Expression
 from .._simulation_records import Quantity, SimulationFile, Term
+from ._calibrate import Priors
+from ._found import within_bounds
 from ._problem import Problem
 from ._weighed import Estimate
 
@@ -15,6 +17,7 @@ from ._weighed import Estimate
 def augmented(
     file: SimulationFile,
     problem: Problem,
+    priors: Priors,
     estimate: Estimate,
     coefficients: Mapping[int, Mapping[str, float]],
     expressions: Mapping[int, Expression],
@@ -25,7 +28,7 @@ def augmented(
     `expressions` of forces without a name.
     """
     parameters, c = dict(file.parameters), problem.calibrated
-    z = estimate.z[problem.head : problem.slots]
+    z = within_bounds(problem, priors, estimate).z[problem.head : problem.slots]
     sd = np.sqrt(np.diag(estimate.covariance)[problem.head : problem.slots])
     for j in range(c.parameters):
         if c.names[j] in parameters:

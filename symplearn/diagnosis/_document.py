@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from .._recording import Recording
+from ._calibrate import Priors
+from ._found import within_bounds
 from ._outlook import Outlook
 from ._posterior import Posterior, Weighed
 from ._problem import Problem
@@ -17,8 +19,9 @@ _LISTED = 12
 _LEAST = 5e-4
 
 
-def parameters(problem: Problem, estimate: Estimate, inflation: float) -> dict[str, Any]:
-    """Posterior of everything calibrated."""
+def parameters(problem: Problem, priors: Priors, estimate: Estimate, inflation: float) -> dict[str, Any]:
+    """Posterior of everything calibrated, its middle as far as bounds allow."""
+    estimate = within_bounds(problem, priors, estimate)
     part = slice(problem.head, problem.head + problem.calibrated.size)
     sd = np.minimum(np.sqrt(np.diag(estimate.covariance)[part] * inflation), problem.calibrated.sd)
     return {
