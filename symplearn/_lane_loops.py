@@ -181,7 +181,10 @@ def _still_more(values: Sequence[Any], axes: Sequence[int | None], **p: Any) -> 
 
     operands = [merged(*one) for one in zip(values, axes, p["beside"], strict=True)]
     beside = tuple(had or axis is not None for axis, had in zip(axes, p["beside"], strict=True))
-    found = _many.bind(*operands, **{**p, "beside": beside, "lanes": size * lanes})
+    rest = {name: value for name, value in p.items() if name not in ("beside", "lanes")}
+    # What one lane has as single numbers may be no matrices of many, of which machine code could be written.
+    way = _beside_as_scan if code_of(Loop(rest), beside, size * lanes) is None else _many.bind
+    found = way(*operands, beside=beside, lanes=size * lanes, **rest)
     apart = [one.reshape(*one.shape[:-1], size, lanes) for one in found]
     return apart, [one.ndim - 2 for one in apart]
 

@@ -136,6 +136,21 @@ def test_lanes_of_lanes_are_beside_each_other(outer, inner, monkeypatch):
     assert names and None not in names
 
 
+def test_lanes_of_lanes_of_which_one_alone_can_be_written(monkeypatch):
+    """Of one lane any entry is read at a place that is known while it runs, of several it is not: mapped once more, the
+    loop is XLA's."""
+    names, x, places = counted(monkeypatch), jnp.asarray(lanes_of(4)).reshape(4, 1, 3), jnp.array([2, 0, 1, 1])
+
+    def function(x, places):
+        return lax.scan(lambda c, k: (jnp.sin(c) + lax.dynamic_index_in_dim(c, k, keepdims=False), c[0]), x, places)
+
+    def twice(one):
+        return jax.jit(jax.vmap(jax.vmap(one, (0, None)), (0, None)))
+
+    same(twice(with_lane_loops(function))(x, places), twice(function)(x, places))
+    assert names[0] is not None and names[-1] is None
+
+
 @pytest.mark.parametrize(
     "step",
     [lambda c, row: (jnp.sort(c), None), lambda c, row: (lax.while_loop(lambda d: d[0] < 1, lambda d: d + 1, c), None),
