@@ -35,7 +35,7 @@ from ._record import Diagnosis, Forecast, Series
 from ._trajectory import Stepper
 from ._units import coefficient_units, time_unit
 from ._unnamed import written
-from ._warnings import doubled, warnings
+from ._warnings import doubled, set_back, warnings
 from ._weighed import Estimate, coloured_inflation
 from ._words import equation_lines, finding_sentence, next_measurement
 
@@ -184,7 +184,8 @@ class Answer:
                 self.without,
                 self.with_,
                 self.forecast,
-            ),
+            )
+            + set_back(before, after),
             "thinning": {
                 "rows": sum(r.given for r in self.problem.rows),
                 "used": sum(r.used for r in self.problem.rows),

@@ -71,7 +71,7 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
     """
     problem = stepper.problem
     short = [[min(n, least) for n in rows] for least in _SHORT]
-    short += windows(rows, (0.02, 0.04, 0.08), max(_SHORT[0], 4 * problem.state))
+    short += windows(rows, (0.02, 0.04, 0.08), max(_SHORT[-1], 4 * problem.state))
     tight = _tightened(problem, priors)
     fits = calibrate(stepper, _tried(stepper, priors, short[0]), [()] * _TRIED, tight, short[0], 40)
     for number, window in enumerate(short[1:], 1):

@@ -1,7 +1,8 @@
 """What a reader of a diagnosis must be told."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from .._simulation_records import SimulationFile
 from ._found import Found
 from ._locate import spell_windows
 from ._outlook import Outlook
+from ._own_period import in_tune
 from ._posterior import Posterior, Weighed
 from ._problem import Problem
 from ._record import Forecast
@@ -19,6 +21,8 @@ from ._weighed import Estimate
 _TOLD = 1 / 1.05
 # A forecast is far off that leaves the middle of what was read by this many times its range.
 _FAR = 10.0
+# Held-out errors that grow by less than this are as large as before.
+_WORSE = 1.1
 
 # What is left beside the findings, by kind of remainder.
 _REMAINDERS = {
@@ -81,6 +85,8 @@ def warnings(
     if chosen is not None and chosen.best.kind != "white":
         when = _when(problem, recordings, chosen.best)
         out.append(f"a remainder without a name is left beside the findings: {_REMAINDERS[chosen.best.kind]}{when}")
+    if chosen is not None:
+        out += in_tune(problem, after)
     if chosen is not None and any(o.estimate.bends for o in with_):
         out.append("what is known of that error is part of the readings that are expected with the findings; "
                    "augmented.toml does not have it")  # fmt: skip
@@ -91,6 +97,17 @@ def warnings(
         out.append(f"evidence was discounted by a factor of {1 / odds.tempered:.1f}: "
                    "the remainder is not white on the scale of the motion")  # fmt: skip
     return out
+
+
+def set_back(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
+    """Which readings the held-out run misses by more with the findings than without, of what `fit` tells of both."""
+    first, later = before["holdout_rmse"] or {}, after["holdout_rmse"] or {}
+    worse = [name for name, error in first.items() if error is not None and (later.get(name) or 0.0) > _WORSE * error]
+    return [
+        f"the held-out rows of {name} are missed by more with the findings than without: "
+        f"{later[name]:.4g} against {first[name]:.4g}"
+        for name in worse
+    ]
 
 
 def _same(recordings: Sequence[Recording]) -> list[tuple[int, int]]:

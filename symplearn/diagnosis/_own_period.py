@@ -1,0 +1,47 @@
+"""Effects of an outside clock that goes at the motion's own period, as anything does that goes with the motion."""
+
+import numpy as np
+from jaxtyping import Float
+
+from .._effects import FORCING, MODULATION
+from .._rows import Rows
+from ._problem import Problem
+from ._weighed import Estimate
+
+# Frequencies that differ by less than this share, or by less than one in the whole time, are the same.
+_ALIKE = 0.02
+# Points of the periodogram for each that the fitted rows tell apart.
+_FINER = 8
+
+
+def in_tune(problem: Problem, estimate: Estimate) -> list[str]:
+    """Which forcings and modulations of an estimate have the period of what is read in their recordings."""
+    out = []
+    for member, place in problem.placed(estimate.combination):
+        one, omega = problem.candidate(member), float(estimate.z[place.stop - 1])
+        rows = [problem.rows[r] for r in problem.members[member].recordings]
+        if one.effect in (FORCING, MODULATION) and any(_is_own(omega, some) for some in rows):
+            period = f"{2 * np.pi / omega:.4g}"
+            out.append(
+                f"{one.effect.name} of {one.target} has the period of the motion itself, {period}: an error of the "
+                "simulation that goes with the motion, as of a sensor or of the shape of a force, may look like it; a "
+                "clock from outside keeps its period at another amplitude"
+            )
+    return out
+
+
+def _is_own(omega: float, rows: Rows) -> bool:
+    times = rows.times[: rows.fitted]
+    near = max(_ALIKE * abs(omega), 2 * np.pi / (times[-1] - times[0])) if len(times) > 1 else 0.0
+    return any(abs(omega - line) < near for line in map(lambda y: _line(times, y), rows.readings[: rows.fitted].T))
+
+
+def _line(times: Float[np.ndarray, " time"], column: Float[np.ndarray, " time"]) -> float:
+    """The angular frequency at which a column swings most; NaN where too little was read."""
+    seen = ~np.isnan(column)
+    if seen.sum() < 8:
+        return np.nan
+    grid = np.linspace(times[0], times[-1], len(times))
+    even = np.interp(grid, times[seen], column[seen])
+    power = np.abs(np.fft.rfft((even - even.mean()) * np.hanning(len(grid)), _FINER * len(grid)))
+    return 2 * np.pi * float(np.argmax(power)) / (_FINER * (grid[1] - grid[0]) * len(grid))

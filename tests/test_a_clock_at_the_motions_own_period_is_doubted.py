@@ -1,0 +1,46 @@
+"""An outside clock that is found at the motion's own period is told with a warning; one at another period is not. Nor
+is it kept quiet where findings predict worse than nothing."""
+
+import engine_cases as cases
+import numpy as np
+import pytest
+
+from symplearn.diagnosis._own_period import in_tune
+from symplearn.diagnosis._warnings import set_back
+from symplearn.diagnosis._weighed import Estimate
+
+TIMES = np.linspace(0.0, 60.0, 600)
+
+
+def said(name, omega, readings=None):
+    """What is said of an effect with a frequency, in a spring that swings once in 2 pi and fades."""
+    readings = np.exp(-0.03 * TIMES) * np.cos(TIMES) if readings is None else readings
+    file = cases.simulation("p**2/2 + k*q**2/2", more="[parameters]\nk = 1.0\n")
+    p = cases.problem(file, [cases.recorded(TIMES, readings)], 0.1)
+    (member,) = [m for m in p.searched if p.candidate(m).effect.name == name][:1]
+    z = np.zeros(p.size)
+    z[p.slots + p.candidate(member).effect.size - 1] = omega
+    return in_tune(p, Estimate((member,), "white", z, np.eye(p.size), np.ones(1), 0.0, True))
+
+
+@pytest.mark.parametrize("name", ["periodic_forcing", "parametric_modulation"])
+def test_only_the_own_period_is_doubted(name):
+    """Within what a recording of ten periods tells apart, a tenth; nothing of a frequency that is 30 % higher."""
+    (warning,) = said(name, 1.03)
+    assert name in warning and f"{2 * np.pi / 1.03:.4g}" in warning
+    assert said(name, 1.3) == []
+
+
+def test_no_other_effect_is():
+    """An unseen oscillator may well be tuned like the one that is seen; and what is not read has no period."""
+    assert said("hidden_oscillator", 1.0) == []
+    assert said("periodic_forcing", 1.0, np.where(TIMES > 0.3, np.nan, 1.0)) == []
+
+
+def test_findings_that_set_back_are_told():
+    """Of three columns the one whose error grows by more than a tenth; none where nothing was held out."""
+    before, after = ({"holdout_rmse": {"a": 1.0, "b": 1.0, "c": x}} for x in (None, 2.0))
+    after["holdout_rmse"] |= {"a": 1.05, "b": 3.5}
+    (warning,) = set_back(before, after)
+    assert warning.endswith("3.5 against 1") and " b " in warning
+    assert set_back({"holdout_rmse": None}, {"holdout_rmse": None}) == []
