@@ -1,4 +1,4 @@
-"""However few unknowns a start has, it is found in as many rows as show the motion turn, so that no stiffness is lost."""
+"""However few unknowns a start has, it is found in rows that show the motion turn, so that no stiffness is lost."""
 
 import engine_cases as cases
 import numpy as np

@@ -81,6 +81,18 @@ def test_the_trajectory_that_holds_is_shown(clear):
     assert shown.z[place] == pytest.approx(0.02, abs=3 * np.sqrt(shown.covariance[place, place]))
 
 
+def test_the_trajectory_runs_on_whatever_the_sensor_remembers(clear):
+    """Where no trajectory holds either, the numbers told are those beside the sensor's error; what runs on is the fit
+    of the whole trajectory, if there is one that converged."""
+    found, (*_, drag) = clear
+    coloured = found.of(drag, "coloured")
+    lost = replace(found, ahead={drag: replace(found.ahead[drag], holds=False)})
+    assert found.shown(drag, coloured).kind == "white"
+    assert lost.told(drag, coloured) is coloured and lost.shown(drag, coloured).kind == "white"
+    away = [replace(one, converged=one.kind != "white") for one in found.estimates[drag]]
+    assert replace(lost, estimates={drag: away}).shown(drag, coloured).kind == "coloured"
+
+
 def test_white_noise_needs_no_second_look():
     """Where the best answer leaves nothing but noise, evidence alone counts, and the best estimate is shown."""
     found, (*_, drag) = found_in(0.0)

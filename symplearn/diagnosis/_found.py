@@ -145,16 +145,24 @@ class Found:
     def told(self, combination: Combination, best: Estimate) -> Estimate:
         """The estimate whose numbers are told: the best one; where a clear remainder is left, the trajectory fit if
         that holds on ahead, as wide as its errors are long-lived."""
-        white, one = self.of(combination, "white"), self.ahead.get(combination)
-        if one is None or not one.holds or white is None or not white.converged:
-            return best
-        return replace(white, covariance=white.covariance * white.inflation)
+        one = self.ahead.get(combination)
+        return self._trajectory_fit(combination, best) if one is not None and one.holds else best
 
     def shown(self, combination: Combination, best: Estimate) -> Estimate:
         """The estimate to run on: the one that is told, as far as its signs and bounds allow. But a clock that may
         wander excuses the phase, which a run goes on from; there the best of the others, of which the evidence of one
-        that did not converge says nothing, however large."""
+        that did not converge says nothing, however large. Where the remainder is clear, an error of the sensor that
+        remembers itself is as much of a guess, and the fit that has made the run itself as near as can be runs on."""
         told = self.told(combination, best)
         others = [one for one in self.estimates[combination] if one.kind != told.kind and one.converged]
         run_on = speaker(others) if told.kind == "clock" and others else told
+        if run_on.kind == "coloured" and combination in self.ahead:
+            run_on = self._trajectory_fit(combination, run_on)
         return within_bounds(self.problem, self.priors, run_on)
+
+    def _trajectory_fit(self, combination: Combination, other: Estimate) -> Estimate:
+        """The fit under white noise, as wide as its errors are long-lived; another one where that did not converge."""
+        white = self.of(combination, "white")
+        if white is None or not white.converged:
+            return other
+        return replace(white, covariance=white.covariance * white.inflation)
