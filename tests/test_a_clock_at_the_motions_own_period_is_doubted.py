@@ -31,6 +31,13 @@ def test_only_the_own_period_is_doubted(name):
     assert said(name, 1.3) == []
 
 
+def test_half_of_it_is_where_a_stiffness_is_modulated():
+    """As one that goes with place is; a force that comes twice in a period is none that goes with the motion."""
+    (warning,) = said("parametric_modulation", 2.02)
+    assert "half the period" in warning
+    assert said("periodic_forcing", 2.02) == []
+
+
 def test_no_other_effect_is():
     """An unseen oscillator may well be tuned like the one that is seen; and what is not read has no period."""
     assert said("hidden_oscillator", 1.0) == []

@@ -1,13 +1,17 @@
-"""Effects of an outside clock that goes at the motion's own period, as anything does that goes with the motion."""
+"""Effects of an outside clock that goes at the motion's own period, as anything does that goes with the motion; a
+stiffness that goes with place swings twice in it."""
 
 import numpy as np
 from jaxtyping import Float
 
-from .._effects import FORCING, MODULATION
+from .._effects import FORCING, MODULATION, Effect
 from .._rows import Rows
 from ._problem import Problem
 from ._weighed import Estimate
 
+# What goes with the motion may be told as these, and how often in its period they come round.
+_WHOLE, _HALF = {"the period": 1}, {"half the period": 2}
+_OWN: dict[Effect, dict[str, int]] = {FORCING: _WHOLE, MODULATION: _WHOLE | _HALF}
 # Frequencies that differ by less than this share, or by less than one in the whole time, are the same.
 _ALIKE = 0.02
 # Points of the periodogram for each that the fitted rows tell apart.
@@ -20,12 +24,13 @@ def in_tune(problem: Problem, estimate: Estimate) -> list[str]:
     for member, place in problem.placed(estimate.combination):
         one, omega = problem.candidate(member), float(estimate.z[place.stop - 1])
         rows = [problem.rows[r] for r in problem.members[member].recordings]
-        if one.effect in (FORCING, MODULATION) and any(_is_own(omega, some) for some in rows):
-            period = f"{2 * np.pi / omega:.4g}"
+        shares = _OWN.get(one.effect, {}).items()
+        own = [share for share, often in shares if any(_is_own(omega / often, some) for some in rows)]
+        if own:
             out.append(
-                f"{one.effect.name} of {one.target} has the period of the motion itself, {period}: an error of the "
-                "simulation that goes with the motion, as of a sensor or of the shape of a force, may look like it; a "
-                "clock from outside keeps its period at another amplitude"
+                f"{one.effect.name} of {one.target} has {own[0]} of the motion itself, {2 * np.pi / omega:.4g}: an "
+                "error of the simulation that goes with the motion, as of a sensor or of the shape of a force, may "
+                "look like it; a clock from outside keeps its period at another amplitude"
             )
     return out
 
