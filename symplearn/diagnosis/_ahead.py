@@ -3,7 +3,7 @@
 Evidence then rests on a guess of what the remainder is, and Bayes factors of wrong models mislead. Every combination is
 fitted to the first part of the rows as a plain trajectory, and run on over the others (Buerkner, Gabry and Vehtari
 2020). Errors ahead are of one piece, an amplitude and a phase that drift away, so each free run counts as two readings.
-What happens at one time no earlier part can foretell, nor can it without: there it counts as the best of the others.
+What happens at one time no earlier part can foretell: there a combination counts as it does without it.
 """
 
 from collections.abc import Sequence
@@ -41,7 +41,9 @@ def look_ahead(stepper: Stepper, found: Found, rows: Sequence[int]) -> None:
         return
     near = [c for c in ranked if found.best(c) > top - _REACH and found.of(c, "white")]
     bare = [c for c in found.estimates if c == () and c not in near[:_MOST]]
-    found.ahead = _scores(stepper, found, [*near[: _MOST - len(bare)], *bare], rows)
+    tried = [*near[: _MOST - len(bare)], *bare]
+    less = dict.fromkeys(_before_it(stepper.problem, c) for c in tried)
+    found.ahead = _scores(stepper, found, [*tried, *(c for c in less if c not in tried and found.of(c, "white"))], rows)
 
 
 @np.errstate(all="ignore")  # a lane that diverged has no score
@@ -56,8 +58,9 @@ def _scores(
         fits = calibrate(stepper, begin, combinations, found.priors, first, _STEPS, held=later)
         inside, ahead = _squares(stepper, fits.z, combinations, rows, first)
         value = -0.5 * _READINGS * np.log(ahead).sum(1)
-        others = value[~later & np.isfinite(value)]
-        total += np.where(later, others.max() if others.size else 0.0, value)
+        known = [_known(stepper.problem, c, combinations) if late else k
+                 for k, (c, late) in enumerate(zip(combinations, later, strict=True))]  # fmt: skip
+        total += value[known]
         holds &= later | (ahead < _HOLDS**2 * inside).all(1)
     total = np.where(np.isfinite(total), total, -np.inf)
     if not np.isfinite(total.max()):
@@ -65,6 +68,17 @@ def _scores(
     bare = total[combinations.index(())] if () in combinations else -np.inf
     better, score = total > bare + _BETTER, np.maximum(total - total.max(), -_WORST)
     return {c: Ahead(float(s), bool(h), bool(b)) for c, s, h, b in zip(combinations, score, holds, better, strict=True)}
+
+
+def _before_it(problem: Problem, combination: Combination) -> Combination:
+    """A combination without what happens at one time."""
+    return tuple(m for m in combination if problem.candidate(m).effect not in (IMPULSE, REGIME))
+
+
+def _known(problem: Problem, combination: Combination, combinations: list[Combination]) -> int:
+    """Which lane stands for one before something happens: without it, or, where that was not fitted, itself."""
+    before = _before_it(problem, combination)
+    return combinations.index(before if before in combinations else combination)
 
 
 def _is_later(problem: Problem, z: np.ndarray, combination: Combination, first: Sequence[int]) -> bool:
