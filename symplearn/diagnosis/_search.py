@@ -245,7 +245,10 @@ class Search:
         best = sorted(best, key=self.found.best, reverse=True)
         top = self.found.best(best[0]) if best else -np.inf
         kept: dict[tuple[Combination, int], Start] = {}
-        for k, c in enumerate([c for c in best if self.found.best(c) > top - _REACH][:_BASES]):
+        near = [c for c in best if self.found.best(c) > top - _REACH][:_BASES]
+        # What an error of the sensor hides, an effect less, shows where there is none.
+        plain = sorted(best, key=self._white, reverse=True)[:1]
+        for k, c in enumerate(dict.fromkeys([*near, *plain])):
             white = self.found.of(c, "white")
             assert white is not None  # every combination is weighed under white noise first
             # Thinned frequencies miss an oscillation that stays in tune throughout, so the best one has more of them.
@@ -338,10 +341,19 @@ class Search:
         return tuple(sorted((*self.base, member)))
 
     def _gained(self, size: int) -> bool:
-        """Whether the best of this size beats the best of smaller ones, so that a larger one may be worth it."""
-        smaller = max(self.found.best(c) for c in self.found.estimates if self._size(c) < size)
-        mine = [self.found.best(c) for c in self.found.estimates if self._size(c) == size]
-        return max(mine, default=-np.inf) > smaller + _WORTH
+        """Whether the best of this size beats the best of smaller ones, so that a larger one may be worth it; or by far
+        under white noise alone, where an error of the sensor stands for what is missing in both."""
+        smaller = [c for c in self.found.estimates if self._size(c) < size]
+        mine = [c for c in self.found.estimates if self._size(c) == size]
+        return any(
+            max(map(value, mine), default=-np.inf) > max(map(value, smaller)) + least
+            for value, least in ((self.found.best, _WORTH), (self._white, _REACH))
+        )
+
+    def _white(self, combination: Combination) -> float:
+        """Log evidence of a combination under white noise alone."""
+        one = self.found.of(combination, "white")
+        return -np.inf if one is None else one.log_evidence
 
     def _weigh_remainders(self) -> None:
         """Errors of the clock, and forces that go with place, beside the best combinations."""
