@@ -162,7 +162,7 @@ def _restriction(effects: str | None, sensor_only: bool, dynamics_only: bool) ->
     from .diagnosis import restriction_of
 
     restriction = restriction_of(effects, sensor_only, dynamics_only)
-    sensors = {EFFECTS[name].family == "sensor" for name in restriction.effects or ()}
+    sensors = {name in EFFECTS and EFFECTS[name].family == "sensor" for name in restriction.effects or ()}
     if sensors == {dynamics_only} and sensor_only != dynamics_only:
         flag = "--sensor-only" if sensor_only else "--dynamics-only"
         raise InputError(f"{flag}: leaves none of the --effects to search; drop one of the two")

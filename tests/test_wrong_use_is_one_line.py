@@ -41,7 +41,7 @@ WRONG = {
         ("--forecast-until", "3"),
         "is 3, and the last observed time is 16; give a time at least 0.2",
     ),
-    "force without a name": (("--effects", "unnamed_force"), "not searched by name"),
+    "force without a name read off a sensor": (("--sensor-only", "--effects", "unnamed_force"), "--sensor-only"),
     "endless forecast": (("--forecast-until", "inf"), "--forecast-until"),
     "restrictions that leave nothing": (("--sensor-only", "--effects", "viscous_damping"), "--sensor-only"),
     "seed beyond 64 bits": (("--seed", "9" * 30), "--seed"),

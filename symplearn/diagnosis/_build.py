@@ -226,7 +226,8 @@ def _calibrated(free: Sequence[tuple[str, int, Quantity, np.ndarray]], parameter
 def restriction_of(
     effects: str | Iterable[str] | None = None, sensor_only: bool = False, dynamics_only: bool = False
 ) -> Restriction:
-    """Which effects to search: `effects` by name, in a list or separated by commas, or all.
+    """Which effects to search: `effects` by name, in a list or separated by commas, or all. With `unnamed_force` among
+    them an expression is tried where none of the others explains the recording.
 
     **Raises:** `InputError` for an unknown effect or a contradiction.
     """
@@ -240,12 +241,7 @@ def _names(effects: str | Iterable[str]) -> tuple[str, ...]:
     given = effects.split(",") if isinstance(effects, str) else effects
     names = tuple(name.strip() for name in map(str, given) if name.strip())
     for name in names:
-        if name == UNNAMED.name:
-            raise InputError(
-                f"--effects: {shown(name)} is not searched by name; leave --effects out, and it is tried where no "
-                "named effect explains the recording"
-            )
-        if name not in EFFECTS:
+        if name not in EFFECTS and name != UNNAMED.name:
             raise InputError(f"--effects: unknown effect {shown(name)}; {nearest(name, EFFECTS, len(EFFECTS))}")
     if not names:
         raise InputError(f"--effects: names no effect; give some of {', '.join(EFFECTS)}, separated by commas")
