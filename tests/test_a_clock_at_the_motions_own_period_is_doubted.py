@@ -38,6 +38,13 @@ def test_half_of_it_is_where_a_stiffness_is_modulated():
     assert said("periodic_forcing", 2.02) == []
 
 
+def test_either_of_two_modes_is_the_motions_own():
+    """Of two carts between springs that swing at 1 and at 1.73, the second one a third as far."""
+    beating = np.cos(TIMES) + 0.33 * np.cos(1.73 * TIMES)
+    assert said("periodic_forcing", 1.73, beating) and said("periodic_forcing", 1.0, beating)
+    assert said("periodic_forcing", 1.4, beating) == []
+
+
 def test_no_other_effect_is():
     """An unseen oscillator may well be tuned like the one that is seen; and what is not read has no period."""
     assert said("hidden_oscillator", 1.0) == []

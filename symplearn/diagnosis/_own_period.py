@@ -14,6 +14,8 @@ _WHOLE, _HALF = {"the period": 1}, {"half the period": 2}
 _OWN: dict[Effect, dict[str, int]] = {FORCING: _WHOLE, MODULATION: _WHOLE | _HALF}
 # Frequencies that differ by less than this share, or by less than one in the whole time, are the same.
 _ALIKE = 0.02
+# Share of the strongest line's power from which others are lines of the motion: far above a Hann window's side lobes.
+_SHARE = 0.02
 # Points of the periodogram for each that the fitted rows tell apart.
 _FINER = 8
 
@@ -36,17 +38,19 @@ def in_tune(problem: Problem, estimate: Estimate) -> list[str]:
 
 
 def _is_own(omega: float, rows: Rows) -> bool:
-    times = rows.times[: rows.fitted]
+    times, columns = rows.times[: rows.fitted], rows.readings[: rows.fitted].T
     near = max(_ALIKE * abs(omega), 2 * np.pi / (times[-1] - times[0])) if len(times) > 1 else 0.0
-    return any(abs(omega - line) < near for line in map(lambda y: _line(times, y), rows.readings[: rows.fitted].T))
+    return any((np.abs(omega - _lines(times, column)) < near).any() for column in columns)
 
 
-def _line(times: Float[np.ndarray, " time"], column: Float[np.ndarray, " time"]) -> float:
-    """The angular frequency at which a column swings most; NaN where too little was read."""
+def _lines(times: Float[np.ndarray, " time"], column: Float[np.ndarray, " time"]) -> Float[np.ndarray, " line"]:
+    """The angular frequencies at which a column swings, each of two modes; none where too little was read."""
     seen = ~np.isnan(column)
     if seen.sum() < 8:
-        return np.nan
+        return np.zeros(0)
     grid = np.linspace(times[0], times[-1], len(times))
     even = np.interp(grid, times[seen], column[seen])
-    power = np.abs(np.fft.rfft((even - even.mean()) * np.hanning(len(grid)), _FINER * len(grid)))
-    return 2 * np.pi * float(np.argmax(power)) / (_FINER * (grid[1] - grid[0]) * len(grid))
+    power = np.abs(np.fft.rfft((even - even.mean()) * np.hanning(len(grid)), _FINER * len(grid)))[1:] ** 2
+    beside = np.pad(power, 1)
+    peaks = np.flatnonzero((power >= beside[:-2]) & (power >= beside[2:]) & (power > _SHARE * power.max()))
+    return 2 * np.pi * (1 + peaks) / (_FINER * (grid[1] - grid[0]) * len(grid))
