@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from symplearn.diagnosis import _start as begin
+from symplearn.diagnosis._drawn import scattered
 from symplearn.diagnosis._motion import stiffening
 from symplearn.diagnosis._sizes import sizes_of_motion
 from symplearn.diagnosis._start import first_fits, priors_without_effects, without_turns
@@ -62,7 +63,7 @@ def test_what_follows_the_first_readings_best_is_tried_first(swings):
     """Of all draws the half that is tried first errs least in the closed form, in either recording; the rest is as it
     was drawn."""
     problem, priors = swings.problem, priors_without_effects(swings.problem)
-    drawn = begin.scattered(problem, priors)
+    drawn = scattered(problem, priors)
     tried = begin._tried(swings, priors, [len(TIMES)] * 2)
     half = len(tried) // 2
     np.testing.assert_array_equal(tried[half:], drawn[:half])

@@ -5,7 +5,7 @@ time in which they do; and what is not read has as much kinetic energy as what i
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ._along import What, along, readings, velocity
 from ._problem import Problem
@@ -29,9 +29,23 @@ def sizes_of_motion(problem: Problem, z: Float[np.ndarray, " z"], r: int) -> Flo
     width, d = problem.equations.width, problem.equations.dim
     if np.isfinite(at_mean[[*range(d), *range(width, width + d)]]).all():
         return at_mean
-    # Where nothing is known the mean is zero, which may be a singularity: no angle, no distance.
-    aside = _sizes_about(problem, z, r, np.where(np.isinf(problem.initial.sd), begin + _ASIDE, begin))
-    return np.where(np.isfinite(at_mean), at_mean, aside)
+    return np.where(np.isfinite(at_mean), at_mean, _sizes_about(problem, z, r, _aside(problem, begin)))
+
+
+@np.errstate(all="ignore")
+def is_read(problem: Problem, z: Float[np.ndarray, " z"], r: int) -> Bool[np.ndarray, " state"]:
+    """Which components of the phase point move what is read.
+
+    **Arguments:** - `z`: the unknowns, at their prior means. - `r`: the recording, from 0.
+    """
+    begin = z[r * problem.state : (r + 1) * problem.state]
+    about = begin, _aside(problem, begin)
+    return np.any([np.isfinite(_sizes_read(problem, z, r, point)) for point in about], axis=0)
+
+
+def _aside(problem: Problem, begin: Float[np.ndarray, " state"]) -> Float[np.ndarray, " state"]:
+    """Where nothing is known the mean is zero, which may be a singularity: no angle, no distance."""
+    return np.where(np.isinf(problem.initial.sd), begin + _ASIDE, begin)
 
 
 def _sizes_about(
@@ -39,8 +53,7 @@ def _sizes_about(
 ) -> Float[np.ndarray, " state"]:
     """The same by displacements from one phase point."""
     width, d, out = problem.equations.width, problem.equations.dim, np.full(problem.state, np.nan)
-    vary, time = _variation(problem, r)
-    shown = np.stack([_shown(_moved(problem, readings, r, z, begin, i), vary) for i in range(problem.state)])
+    time, shown = _variation(problem, r)[1], _sizes_read(problem, z, r, begin)
     pace = np.array([_slope(_moved(problem, velocity, r, z, begin, width + i)[:, i]) for i in range(d)])
     out[:d], out[width : width + d] = shown[:d], shown[width : width + d]
     q, p = out[:d], out[width : width + d]
@@ -48,6 +61,14 @@ def _sizes_about(
     out[:d] = np.where(np.isfinite(q), q, np.sqrt(energy * pace) * time)
     out[width : width + d] = np.where(np.isfinite(p), p, out[:d] / (time * pace))
     return out
+
+
+def _sizes_read(
+    problem: Problem, z: Float[np.ndarray, " z"], r: int, begin: Float[np.ndarray, " state"]
+) -> Float[np.ndarray, " state"]:
+    """What moves a reading by what the readings vary, NaN where nothing does."""
+    vary, _ = _variation(problem, r)
+    return np.array([_shown(_moved(problem, readings, r, z, begin, i), vary) for i in range(problem.state)])
 
 
 def _variation(problem: Problem, r: int) -> tuple[Float[np.ndarray, " channel"], float]:

@@ -10,16 +10,13 @@ from jaxtyping import Float, Int
 
 from ._along import along, along_all, force, readings, velocity
 from ._calibrate import Fits, Priors, calibrate, residuals, weights
+from ._drawn import around, scattered, within_the_motion
 from ._motion import rms
 from ._problem import Problem
-from ._sizes import sizes_of_motion
 from ._trajectory import Predictions, Stepper
 
-# Initial states drawn, starts tried over a few rows, those of them that are followed on, and how far they are spread.
-_DRAWN, _TRIED, _STARTS = 1024, 64, 16
-_SPREADS = (1e-3, 0.1, 1.0, 10.0)
-# Beyond these sizes of a component of the phase point spreads count in that size.
-_SMALL, _BIG = 1e-3, 1e2
+# Starts tried over a few rows, and those of them that are followed on.
+_TRIED, _STARTS = 64, 16
 # Rows of the first windows, at least so many.
 _SHORT = (8, 14)
 # Where nothing is known: this many times the size of what was found.
@@ -72,13 +69,18 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
     problem = stepper.problem
     short = [[min(n, least) for n in rows] for least in _SHORT]
     short += windows(rows, (0.02, 0.04, 0.08), max(_SHORT[-1], 4 * problem.state))
+    priors = within_the_motion(problem, priors)
     tight = _tightened(problem, priors)
     fits = calibrate(stepper, _tried(stepper, priors, short[0]), [()] * _TRIED, tight, short[0], 40)
     for number, window in enumerate(short[1:], 1):
-        z = _recombined(problem, fits.z, fits.predictions, short[number - 1])[:_STARTS]
-        held = tight if number < len(_SHORT) + 1 else priors
-        fits = calibrate(stepper, z, [()] * _STARTS, held, window, 40)
-    value = np.where(np.isfinite(fits.cost), _likelihood(problem, fits, short[-1]), np.inf)
+        before, held = short[number - 1], tight if number < len(_SHORT) + 1 else priors
+        starts = [_recombined(problem, fits.z, fits.predictions, before)[:_STARTS]]
+        if window != before:
+            starts.append(_ahead_of(stepper, fits, held, before, window))
+        ways = [calibrate(stepper, z, [()] * _STARTS, held, window, 40) for z in starts]
+        best = [_likelihood(problem, way, window).min() for way in ways]
+        fits = ways[-1] if best[-1] < best[0] - 2 * _HOPELESS else ways[0]
+    value = _likelihood(problem, fits, short[-1])
     ranked = np.argsort(value)
     near = int((value[ranked] <= value[ranked[0]] + 2 * _HOPELESS * len(rows)).sum())
     apart, alike = _apart_first(fits.z[ranked, : problem.head], near)
@@ -90,7 +92,7 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
 def _tried(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Float[np.ndarray, "lane z"]:
     """Where the first fits begin: half as drawn, half those of many draws that follow a few rows best as they are."""
     drawn = scattered(stepper.problem, priors)
-    predictions = stepper.predict(drawn, [()] * _DRAWN, rows)
+    predictions = stepper.predict(drawn, [()] * len(drawn), rows)
     half = _TRIED // 2
     side_by_side = [(k,) * len(rows) for k in range(half)]
     orders = [order for order, _ in _ranked(stepper.problem, predictions, rows)]
@@ -98,27 +100,19 @@ def _tried(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Float[np.nd
     return np.concatenate([best, drawn[:half]])
 
 
-def scattered(problem: Problem, priors: Priors) -> Float[np.ndarray, "lane z"]:
-    """Prior means with initial states drawn from their priors, or about them where nothing is known."""
-    rng = np.random.default_rng(0)
-    z = np.tile(priors.mean, (_DRAWN, 1))
-    spread = np.resize(_SPREADS, _DRAWN)
-    noise = rng.normal(size=(_DRAWN, problem.head))
-    given = np.tile(np.where(np.isfinite(problem.initial.sd), problem.initial.sd, 0.0), len(problem.rows))
-    unknown = np.tile(np.isinf(problem.initial.sd), len(problem.rows))
-    own = np.concatenate([sizes_of_motion(problem, priors.mean, r) for r in range(len(problem.rows))])
-    # Every other round of spreads counts in the motion's own sizes, which may differ by far; else in one, where spreads
-    # of all sizes reach it.
-    rounds = np.arange(_DRAWN) // len(_SPREADS) % 2 == 1
-    size = np.where(rounds[:, None] & np.isfinite(own), own, _unit_sizes(own))
-    z[:, : problem.head] += np.where(unknown, noise * size * spread[:, None], given * noise)
-    return z
+def _ahead_of(
+    stepper: Stepper, fits: Fits, priors: Priors, rows: Sequence[int], more: Sequence[int]
+) -> Float[np.ndarray, "lane z"]:
+    """Of many draws about the fits those that follow more rows best as they are.
 
-
-@np.errstate(invalid="ignore")
-def _unit_sizes(own: Float[np.ndarray, " head"]) -> Float[np.ndarray, " head"]:
-    """What a start is counted in: one, where spreads of all sizes reach it; else the size of the motion."""
-    return np.where((own < _SMALL) | (own > _BIG), own, 1.0)
+    What a few rows leave open is a valley, and fits slide along it to one place. Where a body comes close to a centre,
+    how it goes on from there is no longer open, and no fit finds the way back.
+    """
+    value = _likelihood(stepper.problem, fits, rows)
+    likely = np.flatnonzero(value <= value.min() + 2 * _HOPELESS * len(rows))
+    drawn = around(stepper.problem, fits, likely, priors, rows)
+    predictions = stepper.predict(drawn, [()] * len(drawn), more)
+    return _recombined(stepper.problem, drawn, predictions, more)[:_STARTS]
 
 
 def without_turns(problem: Problem, z: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
@@ -231,9 +225,10 @@ def _tightened(problem: Problem, priors: Priors) -> Priors:
 
 
 def _likelihood(problem: Problem, fits: Fits, rows: Sequence[int]) -> np.ndarray:
-    """Minus twice the profile likelihood: with an estimated noise the cost alone tells nothing."""
+    """Minus twice the profile likelihood, infinite for a lane that ran away: with an estimated noise the cost alone
+    tells nothing."""
     number = sum((r.counts[:n] > 0).sum(0) for r, n in zip(problem.rows, rows, strict=True))
-    return fits.cost + 2 * (number * np.log(fits.noise)).sum(1)
+    return np.where(np.isfinite(fits.cost), fits.cost + 2 * (number * np.log(fits.noise)).sum(1), np.inf)
 
 
 def typical_forces(problem: Problem, z: np.ndarray, paths: Sequence[np.ndarray]) -> np.ndarray:

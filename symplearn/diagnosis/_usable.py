@@ -10,8 +10,9 @@ from .._recording import Recording
 from .._simulation_records import SimulationFile
 from ._along import along, force, readings, velocity
 from ._build import Restriction
+from ._drawn import scattered
 from ._problem import Problem
-from ._start import priors_without_effects, scattered
+from ._start import priors_without_effects
 
 # Squares of readings, and sums of them, stay numbers below this.
 _LARGEST = 1e100
