@@ -93,3 +93,18 @@ def test_round_off_claims_nothing(stepper, priors):
     number = np.array([len(TIMES)])
     claimed = correlated(stepper.problem, fits, 0, grams, np.zeros(1), number, 0.0, priors)
     assert claimed.log_evidence == -np.inf
+
+
+def test_a_step_that_no_number_can_take_gains_nothing(stepper, priors):
+    """Errors of a thousand noises along one direction are gone after a step of a thousandth, and are still there where
+    a trajectory is so sensitive that the step would be 1e-17 of what it is added to."""
+    fits = calibrate(stepper, priors.mean[None], [()], priors, [len(TIMES)])
+    size, number = 1 + stepper.problem.size, np.array([len(TIMES)])
+    values = []
+    for sensitivity in (1e6, 1e20):
+        row = np.zeros(size)
+        row[:2] = 1e3 * GIVEN, sensitivity * GIVEN  # the error, and its slope in q at the first row
+        values.append(correlated(stepper.problem, fits, 0, np.outer(row, row)[None], np.zeros(1), number, 0.0, priors))
+    taken, lost = (one.log_evidence for one in values)
+    # Half of a thousand squared, and the log of the sensitivities' ratio, by which the posterior is narrower: 32.
+    assert taken - lost == pytest.approx(0.5e6 + np.log(1e14), abs=1.0)  # round-off of 1e40 by 1e-17

@@ -14,6 +14,7 @@ from symplearn.diagnosis._refinement import Refinement
 from symplearn.diagnosis._score import Start
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
+from symplearn.diagnosis._weighed import Mode
 from symplearn.diagnosis._weigher import Weigher
 
 TIMES, NOISE, STIFF = np.linspace(0.0, 100.0, 400), 0.05, 0.3
@@ -52,3 +53,24 @@ def test_the_one_that_stays_takes_over(fitted):
     Refinement(Prospects(w), lambda message: None).weigh_subsets()
     # A fit ends where it promises a thousandth; a hundredth of a nat changes no probability.
     assert w.found.of(pair[:1], "white").log_evidence == pytest.approx(alone.log_evidence, abs=0.01)
+
+
+def test_nothing_takes_over_from_what_does_nothing():
+    """A simulation with nothing left out that was caught in a poorer optimum is fitted again from where a stiffness
+    that is not needed had led; else that would look like what was left out."""
+    readings = np.cos(TIMES) + NOISE * np.random.default_rng(0).normal(size=len(TIMES))
+    file = cases.simulation("p**2/2 + q**2/2", more=f"[recording.noise]\ny = {NOISE}")
+    p = cases.problem(file, [cases.recorded(TIMES, readings)], 0.1)
+    bare, still = priors_without_effects(p), np.zeros_like(TIMES)
+    path = np.stack([np.cos(TIMES), still, -np.sin(TIMES), still], axis=1)
+    w = Weigher(Stepper(p), Found(p, with_effects(p, bare, motion_along(p, bare.mean, [path]))))
+    stiffness = (next(m for m in p.searched if p.candidate(m).effect.name == "linear_stiffness"),)
+    z = bare.mean.copy()
+    z[0] = 1.0
+    w.weigh([Start((), z, 0.0), Start(stiffness, z, 0.0)], whole=True)
+    right = w.found.of((), "white")
+    poor = right.log_evidence - 500
+    w.found.estimates[()] = [replace(right, log_evidence=poor, modes=(Mode(poor, right.z, right.covariance),))]
+    Refinement(Prospects(w), lambda message: None).weigh_subsets()
+    assert w.found.of((), "white").log_evidence == pytest.approx(right.log_evidence, abs=0.01)
+    assert w.found.odds(()) > w.found.odds(stiffness)

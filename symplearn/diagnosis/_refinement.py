@@ -136,7 +136,7 @@ class Refinement:
         for _ in range(MOST - 1):
             ranked = sorted(filter(self._is_worth_it, self.found.estimates), key=self.found.best, reverse=True)[:KEPT]
             less = dict.fromkeys(c[:k] + c[k + 1 :] for c in ranked for k in range(len(c)) if c[k] not in base)
-            some = [c for c in less if c and c not in tried
+            some = [c for c in less if c not in tried
                     and (c not in self.found.estimates or self._is_behind(c, ranked))][: 2 * KEPT]  # fmt: skip
             if not some:
                 break

@@ -178,15 +178,25 @@ def correlated(
         gram, follow, log = amplitudes_out((grams / (noise**2)[:, None, None]).sum(0), 1 + problem.size)
         offset = -0.5 * float((number * np.log(2 * np.pi * noise**2) + logs).sum() + log)
         one = _laplace(problem, combination, gram, offset, fits.z[b], priors)
-        column = np.concatenate([[1.0], -one.step])
+        z = fits.z[b] + one.step
+        column = np.concatenate([[1.0], fits.z[b] - z])
         column = np.concatenate([column, -follow @ column])
         square = np.einsum("i,jik,k->j", column, grams, column)
+        lost = _misfit(gram, fits.z[b] - z) - _misfit(gram, -one.step)
         noise = np.where(free, np.sqrt(np.maximum(square, 1e-300) / np.maximum(number, 1)), noise)
-    z = fits.z[b] + one.step
-    value = _earned(one, fits, b) + occam + strength_gain(problem, combination, priors, z, one.covariance)
+    # A step may be too small for the numbers it is added to: where a trajectory is that sensitive it ran away, and what
+    # the step would have gained is not there.
+    value = _earned(one, fits, b) - 0.5 * max(lost, 0.0)
+    value += occam + strength_gain(problem, combination, priors, z, one.covariance)
     if (square < 0).any():  # round-off of a trajectory that ran away
         value = -np.inf
     return Estimate(combination, "", z, one.covariance, noise, value, bool(fits.converged[b]))
+
+
+def _misfit(gram: Float[np.ndarray, "column column"], change: Float[np.ndarray, " z"]) -> float:
+    """Sum of the squares of the errors [e0, E] (1, change)."""
+    column = np.concatenate([[1.0], change])
+    return float(column @ gram @ column)
 
 
 def amplitudes_out(
