@@ -6,6 +6,7 @@ import engine_cases as cases
 import numpy as np
 import pytest
 from scipy.stats import norm
+from scipy.stats import t as student
 
 from symplearn.diagnosis._calibrate import calibrate
 from symplearn.diagnosis._scan import noise_starts
@@ -56,6 +57,19 @@ def test_an_unfinished_fit_claims_nothing(stepper, priors):
     # leaves that two fifths of the half.
     assert best.log_evidence - owned.log_evidence > 0.3 * (begun.cost[0] - done.cost[0]) > 10
     assert owned.log_evidence < claimed.log_evidence - 10
+
+
+def test_a_promise_is_weighed_with_the_errors_that_it_leaves(stepper, priors):
+    """Of a start at rest, off by more than ten noises, a linear step may promise that nothing is left, and not more:
+    heavier tails, which would excuse the errors before it, gain nothing beside that promise."""
+    z = priors.mean.copy()
+    z[0] = 0.0
+    begun = calibrate(stepper, z[None], [()], priors, [len(TIMES)], iterations=0)
+    errors = stepper.problem.rows[0].readings[:, 0] - begun.predictions[0].readings[0, :, 0]
+    assert np.sqrt(np.mean(errors**2)) > 10 * GIVEN
+    (claimed,) = weigh_white(stepper.problem, replace(begun, converged=np.array([True])), priors, [len(TIMES)])
+    # No reading is likelier than at the peak of the narrower law, Student's of five degrees of freedom.
+    assert claimed.log_evidence < len(TIMES) * student.logpdf(0.0, 5, scale=np.sqrt(3 / 5) * GIVEN)
 
 
 def test_a_wrong_noise_gains_what_the_scatter_says(stepper, priors):

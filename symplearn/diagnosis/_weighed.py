@@ -82,7 +82,11 @@ def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -
         gram = np.block([[np.full((1, 1), square[b]), vector[b][None]], [vector[b][:, None], matrix[b]]])
         one = _laplace(problem, combination, gram, offset[b], fits.z[b], priors)
         scores = _scores(problem, fits, b, r, weight)
-        errors = standardised([x[b] for x in r], weight, fits.noise[b])
+        # Errors as they are where the evidence is taken: after the step that a fit which is done is granted.
+        taken = one.step if fits.converged[b] else np.zeros(problem.size)
+        left = [x[b] - np.einsum("i,itj->tj", taken[problem.local(k)], p.slopes[b])
+                for k, (x, p) in enumerate(zip(r, fits.predictions, strict=True))]  # fmt: skip
+        errors = standardised(left, weight, fits.noise[b])
         value = _earned(one, fits, b) + law_gain(problem, combination, errors)
         value += factor_evidence(problem, combination, fits.noise[b], number)
         value += strength_gain(problem, combination, priors, fits.z[b] + one.step, one.covariance)

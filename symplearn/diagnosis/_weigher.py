@@ -149,7 +149,10 @@ class Weigher:
             # Who is far behind after most of the rows is not fitted to all of them, unless its time may yet come.
             fits = grow(self.stepper, z, candidates, priors, growing[:-1], final=12, held=held)
             values = self._whites(fits, growing[-2])
-            kept = [int(k) for k in np.nonzero(held | (values >= np.nanmax(values) - _BEHIND))[0]]
+            # Of what is done, too: what is not may promise more than there is.
+            near = values >= np.nanmax(values) - _BEHIND
+            near |= fits.converged & (values >= np.nanmax(values[fits.converged], initial=-np.inf) - _BEHIND)
+            kept = [int(k) for k in np.nonzero(held | near)[0]]
             z, candidates, held, growing = fits.z[kept], [candidates[k] for k in kept], held[kept], growing[-1:]
         fits = grow(self.stepper, z, candidates, priors, growing, held=held)
         for b, estimate in enumerate(weigh_white(self.problem, fits, priors, self.rows)):
