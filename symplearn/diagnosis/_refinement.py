@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from .._effects import HIDDEN, STOP
 from ._depths import along_the_depths
+from ._driven import as_driven
 from ._found import Found, speaker
 from ._modes import along_the_modes
 from ._problem import MOST, Combination, Problem
@@ -63,14 +64,16 @@ class Refinement:
             self.weigher.weigh(starts, whole=True)
 
     def move_modes(self, size: int) -> None:
-        """Try the best of a size that have an unseen oscillator with more of the stiffness seen or less."""
+        """Try the best of a size that have an unseen oscillator with more of the stiffness seen or less, and with a
+        periodic force instead."""
         size += len(self.weigher.base)
         ranked = sorted((c for c in self._mine() if len(c) == size), key=self.found.best, reverse=True)
         near = [c for c in ranked if self.found.best(c) > self.found.best(ranked[0]) - _SOFT]
-        starts = [start for c in near for start in along_the_modes(self.weigher, c)]
-        if starts:
+        driven = [start for c in near[:KEPT] for start in as_driven(self.weigher, c)]
+        starts = [start for c in near for start in along_the_modes(self.weigher, c)][:_STIFFER]
+        if starts or driven:
             self.progress("moving stiffness between what is seen and what is not")
-            self.weigher.weigh(starts[:_STIFFER], whole=True)
+            self.weigher.weigh([*starts, *driven], whole=True)
 
     def weigh_like_the_best(self) -> None:
         """What may do as well as the likeliest of every size: some fell behind on the way, from where they began."""
