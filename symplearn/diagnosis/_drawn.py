@@ -41,11 +41,14 @@ def within_the_motion(problem: Problem, priors: Priors) -> Priors:
     """The same with unknown initial states not far beyond the motion's own size: a few rows leave open what is not
     read, and somewhere far off there is always a place from which they come out as well.
 
-    A coordinate that is read needs none, and one that is not may swing about a place away from zero.
+    A coordinate that is read needs none, and one that is not may swing about a place away from zero. Where all are
+    read, nothing is changed.
     """
     size = _sizes(problem, priors)
     read = np.concatenate([is_read(problem, priors.mean, r) for r in range(len(problem.rows))])
     is_place = np.arange(problem.head) % problem.state < problem.equations.width
+    if not (_unknown(problem) & is_place & ~read).any():
+        return priors
     size = np.where(is_place, np.maximum(size, _unit_sizes(size)), size)
     held = np.flatnonzero(_unknown(problem) & np.isfinite(size) & ~(is_place & read))
     precision = priors.precision.copy()

@@ -178,6 +178,10 @@ class Search:
         w.moved_to(stepper, Found(stepper.problem, before.priors, complete=before.complete))
         mine = [c for c in dict.fromkeys([self.base, *kept]) if self._is_mine(c)]
         w.weigh([Start(c, white.z, 0.0) for c in mine if (white := before.of(c, "white"))], whole=True)
+        white = before.of(self.base, "white")
+        if white is not None and self._white(self.base) < white.log_evidence - _REACH:
+            # What goes round once more between two readings looks alike in coarse steps.
+            w.weigh([Start(self.base, self._bare(z), 0.0) for z in self.seeds[:_STARTS]])
         if self._in_time():
             self.refinement.move_places()
         w.add_paths(fit_paths(w.stepper, self.null_paths, w.found.priors, self.rows, 3))

@@ -69,24 +69,34 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
     problem = stepper.problem
     short = [[min(n, least) for n in rows] for least in _SHORT]
     short += windows(rows, (0.02, 0.04, 0.08), max(_SHORT[-1], 4 * problem.state))
-    priors = within_the_motion(problem, priors)
-    tight = _tightened(problem, priors)
-    fits = calibrate(stepper, _tried(stepper, priors, short[0]), [()] * _TRIED, tight, short[0], 40)
-    for number, window in enumerate(short[1:], 1):
-        before, held = short[number - 1], tight if number < len(_SHORT) + 1 else priors
-        starts = [_recombined(problem, fits.z, fits.predictions, before)[:_STARTS]]
-        if window != before:
-            starts.append(_ahead_of(stepper, fits, held, before, window))
-        ways = [calibrate(stepper, z, [()] * _STARTS, held, window, 40) for z in starts]
-        best = [_likelihood(problem, way, window).min() for way in ways]
-        fits = ways[-1] if best[-1] < best[0] - 2 * _HOPELESS else ways[0]
+    fits, nearby = _begun(stepper, priors, short, False), within_the_motion(problem, priors)
     value = _likelihood(problem, fits, short[-1])
+    if nearby is not priors:
+        # The motion's size is an order of magnitude, and may be wrong: only what had gone astray is begun within it.
+        other = _begun(stepper, nearby, short, True)
+        if (better := _likelihood(problem, other, short[-1])).min() < value.min() - 2 * _HOPELESS:
+            fits, value = other, better
     ranked = np.argsort(value)
     near = int((value[ranked] <= value[ranked[0]] + 2 * _HOPELESS * len(rows)).sum())
     apart, alike = _apart_first(fits.z[ranked, : problem.head], near)
     order = ranked[[*apart, *alike]]
     z = np.stack([without_turns(problem, z) for z in fits.z[order]])
     return Fits([()] * _STARTS, z, fits.noise[order], [], fits.cost[order], fits.converged[order])
+
+
+def _begun(stepper: Stepper, priors: Priors, short: Sequence[Sequence[int]], is_careful: bool) -> Fits:
+    """Fits in one window after the other; with care from elsewhere, too, in the valley of the window before."""
+    problem, tight = stepper.problem, _tightened(stepper.problem, priors)
+    fits = calibrate(stepper, _tried(stepper, priors, short[0]), [()] * _TRIED, tight, short[0], 40)
+    for number, window in enumerate(short[1:], 1):
+        before, held = short[number - 1], tight if number < len(_SHORT) + 1 else priors
+        starts = [_recombined(problem, fits.z, fits.predictions, before)[:_STARTS]]
+        if is_careful and window != before:
+            starts.append(_ahead_of(stepper, fits, held, before, window))
+        ways = [calibrate(stepper, z, [()] * _STARTS, held, window, 40) for z in starts]
+        best = [_likelihood(problem, way, window).min() for way in ways]
+        fits = ways[-1] if best[-1] < best[0] - 2 * _HOPELESS else ways[0]
+    return fits
 
 
 def _tried(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Float[np.ndarray, "lane z"]:
