@@ -60,6 +60,7 @@ def windows(rows: Sequence[int], fractions: Sequence[float], least: int) -> list
     return [[max(min(least, n), round(n * fraction)) for n in rows] for fraction in fractions]
 
 
+@np.errstate(all="ignore")  # a lane that ran away is told by its cost
 def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
     """Calibrate initial states, then everything, in short windows from many starts; the best lane comes first.
 
