@@ -14,8 +14,8 @@ from ._score import Start
 from ._stochastic import trajectories
 from ._weigher import Weigher
 
-# Frequencies that are tried in one that a recording tells apart, and how many at most.
-_FINER, _MOST = 4, 4096
+# Frequencies that are tried in one that a recording tells apart, how many at most, and in how many rows.
+_FINER, _MOST, _ROWS = 4, 4096, 2000
 
 
 def as_driven(weigher: Weigher, combination: Combination) -> list[Start]:
@@ -42,7 +42,9 @@ def as_driven(weigher: Weigher, combination: Combination) -> list[Start]:
     z = problem.carried(white.z, combination, driven)
     for r in own:
         z[problem.unseen(r)] = 0.0
-    z[dict(problem.placed(driven))[instead[0]]] = _line(np.concatenate(push), np.concatenate(times), bounds)
+    z[dict(problem.placed(driven))[instead[0]]] = _line(
+        np.concatenate(push)[:_ROWS], np.concatenate(times)[:_ROWS], bounds
+    )
     return [Start(driven, z, 0.0)]
 
 

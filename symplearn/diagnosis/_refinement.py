@@ -69,7 +69,7 @@ class Refinement:
         size += len(self.weigher.base)
         ranked = sorted((c for c in self._mine() if len(c) == size), key=self.found.best, reverse=True)
         near = [c for c in ranked if self.found.best(c) > self.found.best(ranked[0]) - _SOFT]
-        driven = [start for c in near[:KEPT] for start in as_driven(self.weigher, c)]
+        driven = [start for c in near[:_MOVED] for start in as_driven(self.weigher, c)]
         starts = [start for c in near for start in along_the_modes(self.weigher, c)][:_STIFFER]
         if starts or driven:
             self.progress("moving stiffness between what is seen and what is not")

@@ -190,7 +190,7 @@ def correlated(
         noise = np.where(free, np.sqrt(np.maximum(square, 1e-300) / np.maximum(number, 1)), noise)
     # A step may be too small for the numbers it is added to: where a trajectory is that sensitive it ran away, and what
     # the step would have gained is not there.
-    value = _earned(one, fits, b) - 0.5 * max(lost, 0.0)
+    value = _earned(one, fits, b) - 0.5 * max(0.0, lost)
     value += occam + strength_gain(problem, combination, priors, z, one.covariance)
     if (square < 0).any():  # round-off of a trajectory that ran away
         value = -np.inf
