@@ -10,7 +10,13 @@ from symplearn._recording import Recording
 from symplearn._simulation_file import parse_simulation
 from symplearn._simulation_records import SimulationFile
 from symplearn.diagnosis._build import Restriction, augmented_equations, build
+from symplearn.diagnosis._effect_priors import with_effects
+from symplearn.diagnosis._found import Found
+from symplearn.diagnosis._motion import motion_along
 from symplearn.diagnosis._problem import Problem
+from symplearn.diagnosis._start import priors_without_effects
+from symplearn.diagnosis._trajectory import Stepper
+from symplearn.diagnosis._weigher import Weigher
 
 
 def simulation(
@@ -51,6 +57,13 @@ def recorded(times, readings, inputs: Inputs | None = None, number: int = 1, col
 def problem(file: SimulationFile, recordings: Sequence[Recording], substep: float, holdout: float = 0.0) -> Problem:
     """What is fitted, with every effect searched."""
     return build(file, augmented_equations(file), recordings, holdout, substep, Restriction())
+
+
+def weigher(p: Problem, q: np.ndarray, momentum: np.ndarray) -> Weigher:
+    """With priors of effects from a motion of one coordinate, and nothing weighed yet."""
+    bare, still = priors_without_effects(p), np.zeros_like(q)
+    path = np.stack([q, still, momentum, still], axis=1)
+    return Weigher(Stepper(p), Found(p, with_effects(p, bare, motion_along(p, bare.mean, [path]))))
 
 
 def solved(rates: Callable, start: Sequence[float], times: np.ndarray, tolerance: float = 1e-10) -> np.ndarray:

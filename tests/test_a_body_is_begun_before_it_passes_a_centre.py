@@ -51,7 +51,8 @@ def test_an_orbit_is_begun(name):
     width, (x, y, px, py) = p.equations.width, kepler(*PASSING[name][:5])
     found = fits.z[0][[0, 1, width, width + 1]]
     side = np.sign(found[1] * y)
-    # The first turn of a rough recording leaves what is not read open by a quarter; seen: 0.27 at most.
+    # 24 rows are half a turn of the close one, and leave what is not read open: 0.27 was seen there, 0.07 of the others
+    # at most. Half as much again; a start that went astray is off by the size of the orbit, one, or more.
     np.testing.assert_allclose(found * [1, side, 1, side], [x, y, px, py], atol=0.4)
 
 
@@ -62,7 +63,7 @@ def test_an_unread_start_is_as_large_as_the_motion():
     before, width = priors_without_effects(p).precision, p.equations.width
     after = within_the_motion(p, priors_without_effects(p)).precision
     held = [1, width, width + 1]
-    # A factor of three: sizes are orders of magnitude.
+    # Half a decade either way: a size is an order of magnitude, found among decades.
     np.testing.assert_allclose(np.log10(after[held] ** -0.5), 1.0, atol=0.5)
     np.testing.assert_array_equal(np.delete(after, held), np.delete(before, held))
 
@@ -80,7 +81,7 @@ def test_draws_lie_where_the_first_rows_leave_them():
     drawn = around(p, fits, np.array([0]), priors, [9])
     spread = np.cov(drawn[:, own].T)
     expected = 1.75 * np.linalg.inv(design.T @ design / sd**2)
-    # Five standard errors of a variance from 1024 draws of a mixture whose fourth moment is 5.57 squared variances:
-    # sqrt(4.57 / 1024) each.
+    # 0.33: five standard errors of a variance from 1024 draws of a mixture whose fourth moment is 5.57 squared
+    # variances, sqrt(4.57 / 1024) each; the larger of both variances, since the entries are correlated.
     np.testing.assert_allclose(spread, expected, atol=0.33 * np.sqrt(np.outer(*[np.diag(expected)] * 2)).max())
     assert not np.delete(drawn, own, axis=1).any()

@@ -5,13 +5,8 @@ import numpy as np
 import pytest
 
 from symplearn.diagnosis._driven import _line, as_driven
-from symplearn.diagnosis._effect_priors import with_effects
-from symplearn.diagnosis._found import Found
-from symplearn.diagnosis._motion import motion_along
 from symplearn.diagnosis._score import Start
 from symplearn.diagnosis._start import priors_without_effects
-from symplearn.diagnosis._trajectory import Stepper
-from symplearn.diagnosis._weigher import Weigher
 
 TIMES, OMEGA, NOISE = np.linspace(0.0, 60.0, 300), 1.7, 0.01
 
@@ -20,7 +15,8 @@ def test_the_line_of_a_push():
     """Of a swing in closed form beside a weaker one, amplitudes and frequency within what the time tells apart."""
     push = 0.3 * np.cos(OMEGA * TIMES) - 0.4 * np.sin(OMEGA * TIMES) + 0.1 * np.cos(0.6 * TIMES)
     cosine, sine, omega = _line(push, TIMES, (0.1, 4.0))
-    # An eighth of a line is the grid's half step, over which the phase in the middle turns by a fifth.
+    # Frequencies are tried a quarter of a line, 2 pi / 60, apart: half a step off at most. Over that the phase turns by
+    # 0.4 at either end, which takes 3 % off the amplitude, and the weaker swing is a few per cent more.
     assert omega == pytest.approx(OMEGA, abs=2 * np.pi / 60 / 8)
     assert np.hypot(cosine, sine) == pytest.approx(0.5, rel=0.1)
 
@@ -33,12 +29,10 @@ def test_a_force_takes_the_place():
     readings = path[:, 0] + NOISE * np.random.default_rng(0).normal(size=len(TIMES))
     file = cases.simulation("p**2/2 + q**2/2", more=f"[recording.noise]\ny = {NOISE}")
     p = cases.problem(file, [cases.recorded(TIMES, readings)], 0.1)
-    bare, still = priors_without_effects(p), np.zeros_like(TIMES)
-    states = np.stack([path[:, 0], still, path[:, 1], still], axis=1)
-    w = Weigher(Stepper(p), Found(p, with_effects(p, bare, motion_along(p, bare.mean, [states]))))
+    w = cases.weigher(p, *path.T)
     members = {p.candidate(m).effect.name: m for m in p.searched if p.candidate(m).targets == ("q",)}
     hidden, force = (members["hidden_oscillator"],), (members["periodic_forcing"],)
-    z = bare.mean.copy()
+    z = priors_without_effects(p).mean.copy()
     z[0] = 1.0
     z[p.unseen(0)] = 0.2 / 0.01, 0.0
     z[dict(p.placed(hidden))[hidden[0]]] = 0.01, OMEGA  # how strongly it is joined, and its own frequency
@@ -47,6 +41,7 @@ def test_a_force_takes_the_place():
     assert start.combination == force and not start.z[p.unseen(0)].any()
     w.weigh([start], whole=True)
     one = w.found.of(force, "white")
+    # Ten standard errors of a frequency, sqrt(24 / 300) noises over amplitude and time: 0.01, 0.106 and 60.
     assert one.converged and one.z[p.slots + 2] == pytest.approx(OMEGA, abs=0.005)
     assert one.log_evidence > w.found.of(hidden, "white").log_evidence
     assert as_driven(w, force) == []

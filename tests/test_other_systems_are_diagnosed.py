@@ -11,11 +11,11 @@ pytestmark = pytest.mark.slow
 TURN = 2 * np.pi
 
 
-def diagnosed(hamiltonian, coordinates, momenta, read, more, times, shown, noise, seed, given=True):
-    """The document of a diagnosis of readings with Gaussian noise, a share of what they vary, given or not."""
+def diagnosed(hamiltonian, coordinates, momenta, read, more, times, shown, noise, seed):
+    """The document of a diagnosis of readings with Gaussian noise, a share of what they vary, that is given."""
     sd = noise * np.std(shown)
     readings = shown + sd * np.random.default_rng(seed).normal(size=len(times))
-    more = f"[parameters]\n{more}\n" + (f"[recording.noise]\ny = {sd}\n" if given else "")
+    more = f"[parameters]\n{more}\n[recording.noise]\ny = {sd}\n"
     file = cases.simulation(hamiltonian, coordinates, momenta, {"y": read}, more)
     return diagnose(file, [cases.recorded(times, readings)], Options(jobs=1)).document
 
@@ -42,6 +42,8 @@ def test_dry_friction_of_a_pendulum_that_turns_over():
     (finding,) = document["findings"]
     assert (finding["effect"], finding["target"]) == ("coulomb_friction", "th") and finding["probability"] > 0.9
     (size,) = finding["coefficients"].values()
+    # Two hundredths either way of what it was, 0.047: what made the recording is smooth about rest, and the fit is not.
+    # Seen: 0.04695 and 0.04711.
     assert 0.046 < size["interval95"][0] < size["interval95"][1] < 0.048
 
 

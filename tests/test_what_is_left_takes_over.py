@@ -6,16 +6,11 @@ import engine_cases as cases
 import numpy as np
 import pytest
 
-from symplearn.diagnosis._effect_priors import with_effects
-from symplearn.diagnosis._found import Found
-from symplearn.diagnosis._motion import motion_along
 from symplearn.diagnosis._prospects import Prospects
 from symplearn.diagnosis._refinement import Refinement
 from symplearn.diagnosis._score import Start
 from symplearn.diagnosis._start import priors_without_effects
-from symplearn.diagnosis._trajectory import Stepper
 from symplearn.diagnosis._weighed import Mode
-from symplearn.diagnosis._weigher import Weigher
 
 TIMES, NOISE, STIFF = np.linspace(0.0, 100.0, 400), 0.05, 0.3
 PATH = cases.solved(lambda t, x: [x[1], -(1 + STIFF) * x[0]], [1.0, 0.0], TIMES)
@@ -28,11 +23,9 @@ def fitted():
     readings = PATH[:, 0] + NOISE * np.random.default_rng(0).normal(size=len(TIMES))
     file = cases.simulation("p**2/2 + q**2/2", more=f"[recording.noise]\ny = {NOISE}")
     p = cases.problem(file, [cases.recorded(TIMES, readings)], 0.25)
-    bare, still = priors_without_effects(p), np.zeros_like(TIMES)
-    path = np.stack([PATH[:, 0], still, PATH[:, 1], still], axis=1)
-    w = Weigher(Stepper(p), Found(p, with_effects(p, bare, motion_along(p, bare.mean, [path]))))
+    w = cases.weigher(p, *PATH.T)
     pair = tuple(next(m for m in p.searched if p.candidate(m).effect.name == name) for name in NAMES)
-    z = bare.mean.copy()
+    z = priors_without_effects(p).mean.copy()
     z[0], z[p.slots] = 1.0, STIFF
     w.weigh([Start(pair[:1], z, 0.0), Start(pair, z, 0.0)], whole=True)
     return w, pair
@@ -61,11 +54,9 @@ def test_nothing_takes_over_from_what_does_nothing():
     readings = np.cos(TIMES) + NOISE * np.random.default_rng(0).normal(size=len(TIMES))
     file = cases.simulation("p**2/2 + q**2/2", more=f"[recording.noise]\ny = {NOISE}")
     p = cases.problem(file, [cases.recorded(TIMES, readings)], 0.1)
-    bare, still = priors_without_effects(p), np.zeros_like(TIMES)
-    path = np.stack([np.cos(TIMES), still, -np.sin(TIMES), still], axis=1)
-    w = Weigher(Stepper(p), Found(p, with_effects(p, bare, motion_along(p, bare.mean, [path]))))
+    w = cases.weigher(p, np.cos(TIMES), -np.sin(TIMES))
     stiffness = (next(m for m in p.searched if p.candidate(m).effect.name == "linear_stiffness"),)
-    z = bare.mean.copy()
+    z = priors_without_effects(p).mean.copy()
     z[0] = 1.0
     w.weigh([Start((), z, 0.0), Start(stiffness, z, 0.0)], whole=True)
     right = w.found.of((), "white")

@@ -186,10 +186,10 @@ def correlated(
         column = np.concatenate([[1.0], fits.z[b] - z])
         column = np.concatenate([column, -follow @ column])
         square = np.einsum("i,jik,k->j", column, grams, column)
-        lost = _misfit(gram, fits.z[b] - z) - _misfit(gram, -one.step)
         noise = np.where(free, np.sqrt(np.maximum(square, 1e-300) / np.maximum(number, 1)), noise)
     # A step may be too small for the numbers it is added to: where a trajectory is that sensitive it ran away, and what
     # the step would have gained is not there.
+    lost = _misfit(gram, fits.z[b] - z) - _misfit(gram, -one.step)
     value = _earned(one, fits, b) - 0.5 * max(0.0, lost)
     value += occam + strength_gain(problem, combination, priors, z, one.covariance)
     if (square < 0).any():  # round-off of a trajectory that ran away
