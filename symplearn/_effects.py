@@ -106,7 +106,8 @@ class Oscillating(Effect):
         # A negative frequency is the same cosine with the phase reversed.
         phase = np.sign(omega) * (np.arctan2(-sine, cosine) - omega * origin)
         wrapped = np.pi - np.mod(np.pi - phase, 2 * np.pi)
-        return {"a": np.hypot(cosine, sine), "omega": np.abs(omega), "phi": wrapped}
+        # A phase a last digit above -pi is rounded to -pi, which is told as pi (contract).
+        return {"a": np.hypot(cosine, sine), "omega": np.abs(omega), "phi": np.where(wrapped > -np.pi, wrapped, np.pi)}
 
     def inner(self, named: Mapping[str, float], origin: float) -> np.ndarray:
         phase = named["phi"] + named["omega"] * origin

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from symplearn._effects import EFFECTS, Oscillating
@@ -26,6 +26,7 @@ def back(effect, values, origin):
 
 @pytest.mark.parametrize("effect", OSCILLATING, ids=lambda e: e.name)
 @given(a=AMOUNT, omega=FREQUENCY, phi=PHASE, origin=ORIGIN)
+@example(a=1.0, omega=0.03125, phi=-3.1415926535897927, origin=-8.905430694534019)  # was told as -pi
 def test_oscillations_come_back(effect, a, omega, phi, origin):
     """Amplitude, frequency and phase, wherever phases inside count from; the phase lies in (-pi, pi]."""
     found = back(effect, {"a": a, "omega": omega, "phi": phi}, origin)
