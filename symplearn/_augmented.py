@@ -1,6 +1,6 @@
 """The simulation with every word of the vocabulary built in, each behind amplitudes that may be zero."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,7 +9,7 @@ import numpy as np
 import sympy
 from jaxtyping import Array
 
-from ._effects import CENTRAL, SPRING, Candidate, Effect, PowerForce, vocabulary
+from ._effects import CENTRAL, SPRING, Candidate, Effect, Nameless, PowerForce, vocabulary
 from ._separable import is_separable
 from ._symbolic import derivative
 from ._symbolic_slopes import with_slopes
@@ -88,25 +88,24 @@ def equations(
     hidden: bool = True,
     delayed: bool = True,
     origin: float | None = None,
-    unnamed: Mapping[int, tuple[sympy.Expr, ...]] | None = None,
+    nameless: Sequence[Nameless] = (),
 ) -> Equations:
     """Build the augmented simulation from parsed expressions.
 
     **Arguments:** - `hidden`, `delayed`: whether an unseen oscillator and delays of sensors are built in. - `origin`:
-    time that phases inside count from; the first row's by default. - `unnamed`: terms of a force without a name, by
-    coordinate.
+    time that phases inside count from; the first row's by default. - `nameless`: forces without a name.
     """
     coordinates, momenta, names = known.coordinates, known.momenta, [str(q) for q in known.coordinates]
     varying = {str(p): k for k, p in enumerate(parameters)}
-    candidates = vocabulary(names[: known.declared], list(known.readings), varying, unnamed)
+    candidates = vocabulary(names[: known.declared], list(known.readings), varying, nameless)
     size = sum(one.effect.size + one.effect.switched for one in candidates)
     c = [sympy.Symbol(f"c{index}*", real=True) for index in range(size)]
     stored = [one for one in candidates if isinstance(one.effect, PowerForce) or one.effect in (SPRING, CENTRAL)]
     energy = known.hamiltonian + sum(c[one.first] * _potential(one, coordinates) for one in stored)
     forces = list(known.forces)
     for one in candidates:
-        if one.terms:
-            forces[one.place] += sympy.Add(*(c[one.first + k] * term for k, term in enumerate(one.terms)))
+        for place, terms in zip(one.places, one.nameless.pushes if one.nameless else (), strict=False):
+            forces[place] += sympy.Add(*(c[one.first + k] * term for k, term in enumerate(terms)))
     still, driven = zip(*(f.as_independent(*momenta, as_Add=True) for f in forces), strict=True)
     every = [*parameters, *(one.symbol for one in known.further)]
     arguments = [*coordinates, *momenta, *every, *inputs, sympy.Symbol("t", real=True), *c]

@@ -174,7 +174,7 @@ OUTLIERS = Effect("sensor_outliers", amplitudes=0)
 
 # Beside the powers these shape a force of place that has no word; they are never reported.
 SHAPES = (PowerForce("quartic_stiffness", power=4), PowerForce("quintic_stiffness", power=5))
-UNNAMED = Effect("unnamed_force")  # its amplitudes are as many as its expression has terms
+UNNAMED = Effect("unnamed_force")  # its amplitudes are as many as its terms
 
 ON_COORDINATES = (*POWERS, VISCOUS, QUADRATIC, COULOMB, EXCITATION, STOP, FORCING, IMPULSE, HIDDEN)
 ON_PAIRS = (RELATIVE, SPRING, CENTRAL, GYROSCOPIC)
@@ -182,6 +182,25 @@ ON_PARAMETERS = (ERROR, DRIFTING, REGIME, MODULATION)
 ON_COLUMNS = (NOISE, BIAS, GAIN, DRIFT, DELAY, OUTLIERS)
 EFFECTS: dict[str, Effect] = {e.name: e for e in (*ON_COORDINATES, *ON_PAIRS, *ON_PARAMETERS, *ON_COLUMNS)}
 SIDES = ("upper", "lower")
+
+
+@dataclass(frozen=True)
+class Nameless:
+    """A force that has no word: a sum of terms, each of a size of its own.
+
+    **Arguments:** - `places`: numbers of the coordinates that it acts on. - `pushes`: its terms on each of them; terms
+    of one number have one size. - `choices`: the logarithm of how many forces it was chosen from. - `words`: what it
+    does, as in "goes with ..."; empty where only its expression tells.
+    """
+
+    places: tuple[int, ...]
+    pushes: tuple[tuple[sympy.Expr, ...], ...]
+    choices: float = 0.0
+    words: str = ""
+
+    def on(self, place: int) -> "Nameless":
+        """What it is on one of its coordinates."""
+        return replace(self, places=(place,), pushes=(self.pushes[self.places.index(place)],))
 
 
 @dataclass(frozen=True)
@@ -196,7 +215,7 @@ class Candidate:
     places: tuple[int, ...]
     side: str | None = None
     first: int = field(default=0, compare=False)
-    terms: tuple[sympy.Expr, ...] = ()  # of an unnamed force
+    nameless: Nameless | None = None  # what an unnamed force is
 
     @property
     def target(self) -> str | list[str]:
@@ -213,6 +232,13 @@ class Candidate:
         """Effect name and targets, by which findings are told apart."""
         return self.effect.name, self.targets
 
+    def told(self) -> "list[Candidate]":
+        """What it is in an answer, where a force without a name has one coordinate."""
+        if self.nameless is None:
+            return [self]
+        pairs = zip(self.targets, self.places, strict=True)
+        return [replace(self, targets=(q,), places=(i,), nameless=self.nameless.on(i)) for q, i in pairs]
+
     @property
     def values(self) -> slice:
         """Where its values stand in the coefficient vector."""
@@ -226,11 +252,11 @@ def vocabulary(
     coordinates: Sequence[str],
     columns: Sequence[str],
     parameters: Mapping[str, int] | None = None,
-    unnamed: Mapping[int, tuple[sympy.Expr, ...]] | None = None,
+    nameless: Sequence[Nameless] = (),
 ) -> tuple[Candidate, ...]:
     """Every effect on every target of a system, in the order of the coefficient vector.
 
-    `parameters` are the names and numbers of those that may vary; `unnamed` the terms of a force by coordinate.
+    `parameters` are the names and numbers of those that may vary; `nameless` are forces without a word.
     """
     pairs = [(i, j) for j in range(len(coordinates)) for i in range(j)]
     listed: list[Candidate] = []
@@ -244,9 +270,9 @@ def vocabulary(
     for effect in ON_COLUMNS:
         listed += [Candidate(effect, (c,), (j,)) for j, c in enumerate(columns)]
     listed += [Candidate(effect, (q,), (i,)) for effect in SHAPES for i, q in enumerate(coordinates)]
-    for i, terms in (unnamed or {}).items():
-        effect = replace(UNNAMED, amplitudes=len(terms))
-        listed.append(Candidate(effect, (coordinates[i],), (i,), terms=terms))
+    for force in nameless:
+        effect, targets = replace(UNNAMED, amplitudes=len(force.pushes[0])), tuple(coordinates[i] for i in force.places)
+        listed.append(Candidate(effect, targets, force.places, nameless=force))
     first = np.cumsum([0, *(one.effect.size + one.effect.switched for one in listed)])
     return tuple(replace(one, first=int(k)) for one, k in zip(listed, first, strict=False))
 

@@ -108,7 +108,7 @@ def test_what_stopped_at_another_time_begins_where_its_part_did():
     pair = tuple(sorted((blow, stiffness)))
 
     def begun(combination, time):
-        z, where = search._from_seed(), dict(p.placed(combination))
+        z, where = search.from_seed(), dict(p.placed(combination))
         z[where[blow]] = 0.1, time
         return Start(combination, z, 0.0)
 

@@ -114,7 +114,7 @@ class Answer:
     def diagnosis(self, seconds: float) -> Diagnosis:
         f, eq, values = self.file, self.problem.equations, self.values
         chosen: list[tuple[Candidate, Mapping[str, Any]]] = [(self.problem.candidate(m), v) for m, v in values.items()]
-        chosen += [(self.problem.candidate(m), {"expression": e.text}) for m, e in self.expressions.items()]
+        chosen += [(one, {"expression": e.text}) for some in self.expressions.values() for one, e in some.items()]
         forces = {p: e.text for p, e in f.forces.items()}
         readings = {c: e.text for c, e in f.recording.observe.items()}
         lines = (f.coordinates, f.momenta, eq.columns, f.hamiltonian.text, forces, readings)
@@ -134,7 +134,7 @@ class Answer:
     @cached_property
     def told(self) -> dict[int, dict[str, Any]]:
         """The coefficients of every finding that has a name, by member."""
-        named = [m for m in self.after.combination if not self.problem.candidate(m).terms]
+        named = [m for m in self.after.combination if self.problem.candidate(m).nameless is None]
         return {m: coefficients(self.problem, self.found.priors, self.after, m, self._spread()) for m in named}
 
     @cached_property
@@ -143,11 +143,12 @@ class Answer:
         return {m: {name: one["mean"] for name, one in told.items()} for m, told in self.told.items()}
 
     @cached_property
-    def expressions(self) -> dict[int, Expression]:
-        """Forces without a name among the findings, by member."""
+    def expressions(self) -> dict[int, dict[Candidate, Expression]]:
+        """Forces without a name among the findings, by member and what is told of it on each coordinate."""
         places = self.problem.placed(self.after.combination)
-        ones = [(m, self.problem.candidate(m).terms, place) for m, place in places]
-        return {m: written(terms, self.after.z[place]) for m, terms, place in ones if terms}
+        ones = [(m, self.problem.candidate(m).told(), self.after.z[place]) for m, place in places]
+        return {m: {one: written(one.nameless.pushes[0], sizes) for one in told if one.nameless}
+                for m, told, sizes in ones}  # fmt: skip
 
     def _spread(self) -> float:
         return 1.0 / self.posterior.tempered
@@ -199,7 +200,7 @@ class Answer:
     def _next(self) -> str:
         p = self.posterior
         top = max((w.probability for w in p.named), default=0.0)
-        rivals = [[self.problem.candidate(m).key for m in w.combination]
+        rivals = [[one.key for m in w.combination for one in self.problem.candidate(m).told()]
                   for w in p.named if w.probability > max(0.02, 0.1 * top)][:6]  # fmt: skip
         return next_measurement(rivals, self.verdict, p.as_it_is, p.unexplained)
 
@@ -222,13 +223,13 @@ class Answer:
     def _findings(self) -> list[dict[str, Any]]:
         if self.chosen is None:
             return []
-        found = [self._finding(member) for member in self.chosen.combination]
+        members = [(member, one) for member in self.chosen.combination for one in self.problem.candidate(member).told()]
+        found = [self._finding(member, one) for member, one in members]
         return sorted(found, key=lambda one: -(one["log_bayes_factor"] or 0.0))
 
-    def _finding(self, member: int) -> dict[str, Any]:
-        p, one = self.posterior, self.problem.candidate(member)
-        rest = tuple(c for c in self.after.combination if c != member)
-        told = {"expression": self.expressions[member].text} if one.terms else self.told[member]
+    def _finding(self, member: int, one: Candidate) -> dict[str, Any]:
+        p, rest = self.posterior, tuple(c for c in self.after.combination if c != member)
+        told = self._expression(member, one) if one.nameless else self.told[member]
         which = [r + 1 for r in self.problem.members[member].recordings]
         only = None if len(which) == len(self.recordings) else which
         f = self.file
@@ -239,12 +240,21 @@ class Answer:
             "target": one.target,
             "family": one.effect.family,
             "recordings": which,
-            "probability": document.presence(self.problem, p, member),
+            "probability": document.presence(self.problem, p, one),
             "log_bayes_factor": self._against(rest),
-            "coefficients": told,
+            "coefficients": {name: value for name, value in told.items() if name != "relative_sd"},
             "sentence": finding_sentence(one, told, self._strength(member), units, self._rivals(member), only),
         }
-        return found | ({"side": one.side} if one.side is not None else {})
+        further = {"side": one.side, "relative_sd": told.get("relative_sd")}
+        return found | {name: value for name, value in further.items() if value is not None}
+
+    def _expression(self, member: int, one: Candidate) -> dict[str, Any]:
+        """A force without a name on one coordinate, and how well its size is known where it has one."""
+        text, place = self.expressions[member][one].text, dict(self.problem.placed(self.after.combination))[member]
+        if one.effect.amplitudes > 1:
+            return {"expression": text}
+        sd = np.sqrt(self.after.covariance[place, place].item() * self._spread())
+        return {"expression": text, "relative_sd": float(sd / max(abs(self.after.z[place].item()), 1e-300))}
 
     def _against(self, rest: Combination) -> float | None:
         """Log Bayes factor against a smaller combination; against nothing at all where that one cannot be fitted."""
@@ -264,10 +274,10 @@ class Answer:
 
     def _rivals(self, member: int) -> list[str]:
         """Effects that could stand in this one's place: in a likely combination that lacks it."""
-        mine = {self.problem.candidate(m).key for m in self.after.combination}
-        key, out = self.problem.candidate(member).key, []
+        mine = {one.key for m in self.after.combination for one in self.problem.candidate(m).told()}
+        key, out = self.problem.candidate(member).told()[0].key, []
         for w in self.posterior.named:
-            ones = [self.problem.candidate(m) for m in w.combination]
+            ones = [one for m in w.combination for one in self.problem.candidate(m).told()]
             if key not in {one.key for one in ones} and w.probability > 0.1 * self._probability():
                 out += [str(one) for one in ones if one.key not in mine]
         return list(dict.fromkeys(out))[:4]
@@ -292,6 +302,9 @@ class Answer:
         if all(one.effect is IMPULSE for one in chosen):
             times = [self.values[member]["t_star"] for member in self.after.combination]
             return blows_sentence(chosen, times)
+        told = [(one.targets, one.nameless.words) for one in chosen if one.nameless and one.nameless.words]
+        if told:
+            return f"the missing force on {' and '.join(told[0][0])} {told[0][1]}"
         first = moving[0] if moving else strained_coordinates(self.lens)[0]
         return where_sentence(self.problem, self.lens[0], first)
 

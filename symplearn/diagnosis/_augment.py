@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .._effects import EFFECTS
+from .._effects import EFFECTS, Candidate
 from .._expression import Expression
 from .._simulation_records import Quantity, SimulationFile, Term
 from ._calibrate import Priors
@@ -20,12 +20,12 @@ def augmented(
     priors: Priors,
     estimate: Estimate,
     coefficients: Mapping[int, Mapping[str, float]],
-    expressions: Mapping[int, Expression],
+    expressions: Mapping[int, Mapping[Candidate, Expression]],
 ) -> SimulationFile:
     """Findings as `[[terms]]` with point values, merged with a term already there, and recalibrated parameters.
 
     A calibrated parameter keeps its bounds and gets its posterior as prior. `coefficients` are by member, as are the
-    `expressions` of forces without a name.
+    `expressions` of forces without a name, on each coordinate.
     """
     parameters, c = dict(file.parameters), problem.calibrated
     z = within_bounds(problem, priors, estimate).z[problem.head : problem.slots]
@@ -36,8 +36,9 @@ def augmented(
     terms = _recalibrated_terms(file, dict(zip(c.names, zip(z, sd, strict=True), strict=True)))
     for member, values in coefficients.items():
         terms = _merged(terms, _term(problem, member, values))
-    for member, expression in expressions.items():
-        terms = [*terms, replace(_term(problem, member, {}), expression=expression)]
+    for member, some in expressions.items():
+        bare = _term(problem, member, {})
+        terms += [replace(bare, target=one.targets, expression=expression) for one, expression in some.items()]
     return replace(file, parameters=parameters, terms=tuple(terms))
 
 

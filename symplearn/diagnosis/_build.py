@@ -1,16 +1,15 @@
 """From a simulation file and its recordings to the problem that is fitted."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import sympy
 
 import integrators as ig
 
 from .._augmented import Equations, equations
-from .._effects import DELAY, EFFECTS, ERROR, HIDDEN, NOISE, OUTLIERS, UNNAMED, Candidate, Effect
+from .._effects import DELAY, EFFECTS, ERROR, HIDDEN, NOISE, OUTLIERS, UNNAMED, Candidate, Effect, Nameless
 from .._errors import InputError, nearest, shown
 from .._expression import symbol
 from .._recording import Recording
@@ -61,7 +60,7 @@ def augmented_equations(
     start: float = 0.0,
     restriction: Restriction = Restriction(),
     origin: float | None = None,
-    unnamed: Mapping[int, tuple[sympy.Expr, ...]] | None = None,
+    nameless: Sequence[Nameless] = (),
 ) -> Equations:
     """The augmented simulation of a file whose first row used is at time `start`; phases inside count from `origin`.
 
@@ -76,7 +75,7 @@ def augmented_equations(
             hidden=restriction.has(HIDDEN),
             delayed=delayed or restriction.has(DELAY),
             origin=origin,
-            unnamed=unnamed,
+            nameless=nameless,
         )
     except TooLarge:
         raise InputError(

@@ -184,6 +184,14 @@ def _errs(said: Said) -> str:
     )
 
 
+def _is_nameless(said: Said) -> str:
+    sd = said.coefficients.get("relative_sd")
+    known = "" if sd is None else f"Its size is known to {number(100 * sd)} % (one standard deviation). "
+    if said.one.nameless is not None and said.one.nameless.words:
+        return f"{known}It is the likeliest of the simple laws that were tried, and holds where the motion has been."
+    return f"{known}Its form was fitted to the missing force and holds where the motion has been, not beyond."
+
+
 def _same(text: str) -> Callable[[Said], str]:
     return lambda said: text.format(q=said.one.targets[0], q2=said.one.targets[-1])
 
@@ -222,7 +230,7 @@ _DOES: dict[str, Callable[[Said], str]] = {
     "sensor_drift": _wanders,
     "sensor_delay": _lags,
     "sensor_outliers": _errs,
-    "unnamed_force": _same("Its form was fitted to the missing force and holds where the motion has been, not beyond."),
+    "unnamed_force": _is_nameless,
 }
 
 

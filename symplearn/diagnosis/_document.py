@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from .._effects import Candidate
 from .._recording import Recording
 from ._calibrate import Priors
 from ._found import within_bounds
@@ -71,7 +72,7 @@ def told_apart(problem: Problem, named: Sequence[Weighed]) -> list[Weighed]:
     sides together, of which the likeliest speaks for it."""
     groups: dict[tuple[Any, ...], Weighed] = {}
     for w in named:
-        keys = tuple(sorted(problem.candidate(m).key for m in w.combination))
+        keys = tuple(sorted(one.key for m in w.combination for one in problem.candidate(m).told()))
         first = groups.get(keys)
         groups[keys] = replace(first, probability=first.probability + w.probability) if first else w
     return sorted(groups.values(), key=lambda w: -w.probability)
@@ -95,7 +96,7 @@ def alternatives(
 
 
 def _alternative(problem: Problem, combination, unexplained: bool, probability: float) -> dict[str, Any]:
-    found = [problem.candidate(member) for member in combination]
+    found = [one for member in combination for one in problem.candidate(member).told()]
     return {
         "findings": [{"effect": one.effect.name, "target": one.target} for one in found],
         "unexplained": unexplained,
@@ -112,8 +113,8 @@ def family_probability(problem: Problem, posterior: Posterior) -> dict[str, floa
     return dict(sorted(total.items(), key=lambda item: -item[1]))
 
 
-def presence(problem: Problem, posterior: Posterior, member: int) -> float:
+def presence(problem: Problem, posterior: Posterior, told: Candidate) -> float:
     """Probability that one effect and target is present in any combination, in whichever recordings."""
-    key = problem.candidate(member).key
-    having = (w for w in posterior.named if key in {problem.candidate(m).key for m in w.combination})
+    having = (w for w in posterior.named
+              if told.key in {one.key for m in w.combination for one in problem.candidate(m).told()})  # fmt: skip
     return min(1.0, sum(w.probability for w in having))

@@ -11,7 +11,6 @@ from ._activity import powers
 from ._calibrate import Priors
 from ._motion import Motion, rms
 from ._problem import Problem
-from ._unnamed import Proposal
 
 # Prior scale of an effect: its force against the forces already there, its error against the reading, its change of a
 # parameter against the parameter. Readings count from zero, which is the sensor's: a bias errs as much as a scale does.
@@ -90,8 +89,8 @@ def _force_unit(motion: Motion, one: Candidate) -> tuple[float, ...]:
         return (push / (_DEPTH * max(np.ptp(q), 1e-300)),)
     if one.effect is effects.HIDDEN:
         return (push * motion.own_frequency(i) ** 2 / rms(q),)
-    if one.terms:
-        return (1.0,) * len(one.terms)  # see `with_unnamed`
+    if one.nameless is not None:
+        return (1.0,) * one.effect.amplitudes  # see `with_nameless`
     if one.effect is effects.IMPULSE:
         return (push / motion.own_frequency(i),)
     return (push,) * 2  # a cosine and a sine, whose root mean squares add in squares
@@ -123,17 +122,14 @@ def _range(motion: Motion, one: Candidate) -> tuple[float, float]:
     return motion.first, motion.last
 
 
-def with_unnamed(
-    problem: Problem, priors: Priors, listed: Sequence[Proposal], members: Sequence[int], forces: np.ndarray
-) -> Priors:
-    """Priors with those of forces without a name: as strong as every other effect. `forces` as in `Motion`."""
+def with_nameless(problem: Problem, priors: Priors, scales: Sequence[float]) -> Priors:
+    """Priors with those of forces without a name, which stand last, behind all that has some already: `scales` of their
+    amplitudes, in their order."""
     grown = {}
     for name, fill in (("centres", 0.0), ("scales", 1.0), ("lower", -np.inf), ("upper", np.inf)):
         values = np.full(problem.equations.size, fill)
         old = getattr(priors, name)
         values[: len(old)] = old
         grown[name] = values
-    for member, one in zip(members, listed, strict=True):
-        values = STRENGTH * forces[one.coordinate] / np.array(one.spreads)
-        grown["scales"][problem.candidate(member).values] = values
+    grown["scales"][problem.equations.size - len(scales) :] = scales
     return replace(priors, **grown)

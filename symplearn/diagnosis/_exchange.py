@@ -6,7 +6,7 @@ without a refit, so all subsets are compared (Furnival and Wilson 1974); frequen
 """
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,10 +90,23 @@ class Regression:
 
     def subsets(self, size: int, is_known: Callable[[Combination], bool], most: int) -> list[Start]:
         """The best combinations of a size that are not known, by what they gain on the fitted one."""
+        return self._best(self._choices(size - len(self.kept)), is_known, most)
+
+    def with_one_more(self, size: int, is_known: Callable[[Combination], bool], most: int) -> list[Start]:
+        """The same of some of the fitted effects with one that is not among them."""
+        own = [k for k, one in enumerate(self.responses) if one.member in self.combination and k not in self.kept]
+        new = [k for k, one in enumerate(self.responses) if one.member not in self.combination]
+        less = itertools.combinations(own, max(0, size - len(self.kept) - 1))
+        listed = [(*some, k) for some in less for k in new]
+        return self._best(filter(self._is_possible, listed), is_known, most)
+
+    def _best(
+        self, choices: Iterable[tuple[int, ...]], is_known: Callable[[Combination], bool], most: int
+    ) -> list[Start]:
         own = self._solved([k for k, one in enumerate(self.responses) if one.member in self.combination])
         if own is None:
             return []
-        found = [self._solved(c) for c in self._choices(size - len(self.kept)) if not is_known(self._members(c))]
+        found = [self._solved(c) for c in choices if not is_known(self._members(c))]
         ranked = sorted((one for one in found if one is not None), key=lambda one: -one.gain)[:_WEIGHED]
         ahead = own.gain + self._strength(own)
         starts = [Start(self._members(s.chosen), self._begin(s), s.gain + self._strength(s) - ahead) for s in ranked]
@@ -110,8 +123,11 @@ class Regression:
             ranked = sorted(pairs, key=lambda one: -one.gain)
             some = sorted(list(dict.fromkeys(k for one in ranked for k in one.chosen))[:_THREES])
         for chosen in itertools.combinations(some, number):
-            if self.problem.is_possible([self.responses[k].member for k in {*self.kept, *chosen}]):
+            if self._is_possible(chosen):
                 yield chosen
+
+    def _is_possible(self, chosen: tuple[int, ...]) -> bool:
+        return self.problem.is_possible([self.responses[k].member for k in {*self.kept, *chosen}])
 
     def _solved(self, chosen: Sequence[int]) -> Subset | None:
         """The amplitudes of some effects alone; None where one that has a sign would have the other."""

@@ -5,30 +5,23 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .._effects import UNNAMED
 from .._recording import Recording
 from .._simulation_records import SimulationFile
 from ._ahead import look_ahead
 from ._build import augmented_equations, build, first_substep, refined, rows_fitted
 from ._found import Found, doubtful_outliers, speaker
 from ._lasting import total_noise
-from ._locate import strained_coordinates
+from ._nameless import is_clear, weigh_nameless
 from ._null_paths import rough_noise
 from ._options import Options
-from ._outlook import Outlook
-from ._posterior import CONSISTENT, Posterior, posterior
-from ._problem import MOST, Problem
+from ._problem import Problem
 from ._search import Search
 from ._start import first_fits, priors_without_effects
 from ._trajectory import Stepper
-from ._unnamed import proposals
 from ._usable import check_fitted, check_motion, check_readings, check_searched, check_steps
-from ._weighed import Estimate
 
 # Third differences show the noise and some of the motion: the share of them that counts as noise at least.
 _ROUGH = 0.3
-# A remainder is clear that stands this many nats above white noise.
-_CLEAR = 5.0
 
 
 def searched(
@@ -67,11 +60,12 @@ def searched(
         if finer is not stepper.problem:
             options.progress("weighing the best combinations again in finer steps")
             found = search.again(Stepper(finer, options.jobs))
-    found, stepper = _with_unnamed(file, recordings, options, search, found)
+    weigh_nameless(file, recordings, options, search)
+    found = search.found
     options.progress("comparing how well answers predict ahead")
     look_ahead(search.stepper, found, search.rows)
     found.is_fine = is_fine
-    return found, stepper
+    return found, search.stepper
 
 
 def _run(stepper: Stepper, seeds: np.ndarray, deadline: float, options: Options) -> Search:
@@ -92,7 +86,7 @@ def _run(stepper: Stepper, seeds: np.ndarray, deadline: float, options: Options)
             found.stand_by(before)
         best = speaker(found.estimates[max(found.estimates, key=found.odds)])
         doubtful, rival = doubtful_outliers(search.problem, search.base, best), None
-        if not doubtful and _is_clear(found, best):
+        if not doubtful and is_clear(found, best):
             doubtful, rival = frozenset(search.problem.candidate(m).place for m in search.base), search
         if not doubtful or not found.complete:
             return search
@@ -103,43 +97,3 @@ def _run(stepper: Stepper, seeds: np.ndarray, deadline: float, options: Options)
 def _most(found: Found) -> float:
     """What the probability of the likeliest answer goes with."""
     return max(map(found.odds, found.estimates))
-
-
-def _with_unnamed(
-    file: SimulationFile, recordings: Sequence[Recording], options: Options, search: Search, found: Found
-) -> tuple[Found, Stepper]:
-    """Where no name fits, weigh an expression that was fitted to the missing force."""
-    stepper = search.stepper
-    pull = found.of(search.base, "force")
-    if pull is None or pull.intensity is None or not options.restriction.has(UNNAMED):
-        return found, stepper
-    if not _is_open(posterior(stepper.problem, found, 1.0), found):
-        return found, stepper
-    options.progress("looking for an expression of the missing force")
-    outlooks = [Outlook(stepper, pull, r, pull.intensity) for r in range(len(recordings))]
-    if not all(o.ok for o in outlooks):
-        return found, stepper
-    listed = proposals(file, outlooks, strained_coordinates(outlooks))[: MOST - len(search.base)]
-    if not listed:
-        return found, stepper
-    first, middle = float(recordings[0].times[0]), float(np.mean(recordings[0].times[[0, -1]]))
-    built = augmented_equations(file, first, options.restriction, middle, {p.coordinate: p.terms for p in listed})
-    longest = float(np.max(stepper.problem.rows[0].spans.step)) * (1 + 1e-9)
-    problem = build(file, built, recordings, options.holdout, longest, options.restriction)
-    return search.with_unnamed(Stepper(problem, options.jobs), listed), search.stepper
-
-
-def _is_open(odds: Posterior, found: Found) -> bool:
-    """Whether no name fits, or the best ones are many or leave a clear remainder beside them."""
-    if odds.as_it_is >= CONSISTENT:
-        return False
-    if not odds.named or odds.unexplained >= odds.named[0].probability:
-        return True
-    best = odds.named[0].best
-    return len(best.combination) == MOST or _is_clear(found, best)
-
-
-def _is_clear(found: Found, best: Estimate) -> bool:
-    """Whether a clear remainder is left beside an answer."""
-    white = found.of(best.combination, "white")
-    return white is None or best.log_evidence > white.log_evidence + _CLEAR

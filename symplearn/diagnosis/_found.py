@@ -76,7 +76,6 @@ class Found:
     priors: Priors
     estimates: dict[Combination, list[Estimate]] = field(default_factory=dict)
     complete: bool = True
-    choices: dict[int, float] = field(default_factory=dict)  # log of how many expressions a force was chosen from
     ahead: dict[Combination, Ahead] = field(default_factory=dict)  # of the likeliest, beside a clear remainder
     is_fine: bool = True  # whether substeps are as short as the readings ask
 
@@ -136,7 +135,7 @@ class Found:
     @cached_property
     def prices(self) -> Prices:
         """The prior of every combination."""
-        return Prices(self.problem, self.choices)
+        return Prices(self.problem)
 
     def odds(self, combination: Combination) -> float:
         """The same with the combination's prior: what its probability goes with."""

@@ -1,6 +1,5 @@
 """The contract's prior of a combination (section 4): the product of its members' prices."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,13 +14,9 @@ _ANEW = 1.0 / 30.0
 
 @dataclass(frozen=True, eq=False)
 class Prices:
-    """Prior probabilities of effects on targets in recordings, relative to that of nothing left out.
-
-    `choices` is the log of how many expressions a force without a name was chosen from, by member.
-    """
+    """Prior probabilities of effects on targets in recordings, relative to that of nothing left out."""
 
     problem: Problem
-    choices: Mapping[int, float]
 
     @cached_property
     def remainder(self) -> float:
@@ -44,8 +39,9 @@ class Prices:
         return sorted({c.effect.family for c in candidates} | {"any"})
 
     def _of(self, member: int) -> float:
-        if member in self.choices:
-            return self.remainder * float(np.exp(-self.choices[member]))
+        force = self.problem.candidate(member).nameless
+        if force is not None:  # those that it was chosen from share their family
+            return self._share(member) * self.remainder * float(np.exp(-force.choices))
         return self._share(member) * self.whole[self.problem.whole(member)]
 
     def _share(self, member: int) -> float:

@@ -148,10 +148,13 @@ class Problem:
         return out
 
     def is_possible(self, combination: Sequence[int]) -> bool:
-        """Whether a combination can be simulated: each effect and target once, at most one unseen oscillator."""
-        whole = {self.whole(member) for member in combination}
-        hidden = sum(self.candidate(member).effect is HIDDEN for member in combination)
-        return len(whole) == len(combination) <= MOST and hidden <= 1
+        """Whether a combination can be simulated: each effect and target once, at most one unseen oscillator, one force
+        without a name on a coordinate, and no more values than there are slots."""
+        whole, ones = {self.whole(member) for member in combination}, [self.candidate(m) for m in combination]
+        hidden = sum(one.effect is HIDDEN for one in ones)
+        pushed = [i for one in ones if one.nameless for i in one.places]
+        once = len(whole) == len(combination) and len(pushed) == len(set(pushed))
+        return once and len(ones) <= MOST and hidden <= 1 and sum(one.effect.size for one in ones) <= SLOTS
 
     def local(self, recording: int) -> Int[np.ndarray, " local"]:
         """Which entries of z one recording depends on."""

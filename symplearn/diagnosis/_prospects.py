@@ -80,6 +80,17 @@ class Prospects:
         known = [c for c in w.found.estimates if beside is None or w.found.of(c, beside.kind)]
         return regression.subsets(size + len(w.base), set(known).__contains__, number)
 
+    def with_one_of(self, combination: Combination, members: Sequence[int], size: int, number: int) -> list[Start]:
+        """The same of effects of a fitted one with one of some members, in all recordings or in some, that have no
+        place."""
+        w, fits = self.weigher, self._fitted(combination)
+        if fits is None:
+            return []
+        every = [m for one in members for m in (one, *w.problem.variants(one)) if m not in combination]
+        units = {m: Unit(w.problem.whole(m), None) for m in every}
+        regression = Regression(w.stepper, fits, w.rows, w.found.priors, units)
+        return regression.with_one_more(size + len(w.base), set(w.found.estimates).__contains__, number)
+
     def _scanned(self, fits: Fits, most: int) -> list[Start]:
         w, (combination,), (z,) = self.weigher, fits.combinations, fits.z
         grams = on_trajectory(w.stepper, fits, 0, w.rows)

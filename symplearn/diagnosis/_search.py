@@ -8,7 +8,7 @@ import numpy as np
 
 from .._effects import NOISE, OUTLIERS
 from ._calibrate import Priors
-from ._effect_priors import with_effects, with_unnamed
+from ._effect_priors import with_effects
 from ._found import Found
 from ._motion import extent, motion_along
 from ._noisy import PathFit, fit_paths
@@ -22,7 +22,6 @@ from ._spells import Spells
 from ._start import priors_without_effects, with_states
 from ._stochastic import trajectories
 from ._trajectory import Stepper
-from ._unnamed import Proposal
 from ._weigher import KEPT, Weigher
 
 # Combinations of one size are carried on to the next size while within this many nats of the best; where a missing
@@ -83,7 +82,7 @@ class Search:
         """Search, smallest combinations first."""
         self._begin()
         for size in range(1, MOST - len(self.base) + 1):
-            if size > 1 and not self._in_time():
+            if size > 1 and not self.in_time():
                 break
             self.progress(f"looking where {_ONE_MORE[size]} would help")
             if size == 1:
@@ -92,13 +91,13 @@ class Search:
                 self._weigh_in_batches(starts, self._is_near(size - 1))
             else:
                 break
-            if self._in_time():
+            if self.in_time():
                 self.refinement.move_modes(size)
             if size > 1 and not self._gained(size):
                 break
         self._refine()
         self._weigh_remainders()
-        if self._in_time():
+        if self.in_time():
             self.refinement.weigh_beside_the_remainder()
         self.progress("weighing missing forces beside the best combinations")
         self._weigh_forces()
@@ -122,7 +121,7 @@ class Search:
         self.progress("following the recording with a missing force")
         paths = null_paths(w.stepper, self.seed, self.rows, bare, w.path_steps)
         self.null_paths = [replace(fit, combination=self.base) for fit in paths]
-        z, likely = self._likely_paths()
+        self.likely = z, likely = self._likely_paths()
         motion = motion_along(self.problem, z, likely)
         self.typical = motion.forces
         w.found.priors = with_effects(self.problem, with_states(self.problem, bare, likely), motion)
@@ -179,10 +178,10 @@ class Search:
         mine = [c for c in dict.fromkeys([self.base, *kept]) if self._is_mine(c)]
         w.weigh([Start(c, white.z, 0.0) for c in mine if (white := before.of(c, "white"))], whole=True)
         white = before.of(self.base, "white")
-        if white is not None and self._white(self.base) < white.log_evidence - _REACH:
+        if white is not None and self.white(self.base) < white.log_evidence - _REACH:
             # What goes round once more between two readings looks alike in coarse steps.
             w.weigh([Start(self.base, self._bare(z), 0.0) for z in self.seeds[:_STARTS]])
-        if self._in_time():
+        if self.in_time():
             self.refinement.move_places()
         w.add_paths(fit_paths(w.stepper, self.null_paths, w.found.priors, self.rows, 3))
         self._weigh_remainders()
@@ -191,35 +190,28 @@ class Search:
         self._weigh_with_outliers_in()
         return self.found
 
-    def with_unnamed(self, stepper: Stepper, listed: Sequence[Proposal]) -> Found:
-        """Weigh forces without a name, which the problem of `stepper` has beside everything that was found before."""
+    def goes_on(self, stepper: Stepper, priors: Priors) -> None:
+        """Go on with a problem that has more candidates, behind those that this one has."""
         w, before = self.weigher, self.found
         old, new = len(self.problem.equations.candidates), len(stepper.problem.equations.candidates)
 
         def renumbered(combination: Combination) -> Combination:
             return tuple(m // old * new + m % old for m in combination)
 
-        members = list(range(new - len(listed), new))
-        priors = with_unnamed(stepper.problem, before.priors, listed, members, self.typical)
-        choices = {m: one.choices for m, one in zip(members, listed, strict=True)}
         kept = {
             renumbered(c): [replace(e, combination=renumbered(c)) for e in es] for c, es in before.estimates.items()
         }
-        w.moved_to(stepper, Found(stepper.problem, priors, kept, before.complete, choices))
+        w.moved_to(stepper, Found(stepper.problem, priors, kept, before.complete))
         w.owed = {renumbered(c): value for c, value in w.owed.items()}
         w.base = renumbered(w.base)
-        combination, z = tuple(sorted((*self.base, *members))), self._from_seed()
-        for member, place in self.problem.placed(combination):
-            if member in members:
-                z[place] = listed[members.index(member)].sizes
-        w.weigh([Start(combination, z, 0.0)])
-        self._add_forces([combination], 1)
-        return self.found
+        self.null_paths = [replace(path, combination=renumbered(path.combination)) for path in self.null_paths]
+        self.prospects, self.remainders = Prospects(w), Remainders(w, self.progress)
+        self.refinement = Refinement(self.prospects, self.progress)
 
     def _refine(self) -> None:
         """The best once more from elsewhere, with what may do as well, and with what is left without a member."""
         for part in (self.refinement.move_places, self.refinement.weigh_like_the_best, self.refinement.weigh_grown):
-            if self._in_time():
+            if self.in_time():
                 part()
         self.refinement.weigh_subsets()
 
@@ -231,14 +223,14 @@ class Search:
         """Effects beside outliers that are taken out."""
         return len(combination) - len(self.base)
 
-    def _from_seed(self) -> np.ndarray:
+    def from_seed(self) -> np.ndarray:
         return self._bare(self.seed)
 
     def _bare(self, z: np.ndarray) -> np.ndarray:
         """The same without effects."""
         return np.where(np.arange(len(z)) < self.problem.slots, z, 0.0)
 
-    def _in_time(self) -> bool:
+    def in_time(self) -> bool:
         if time.monotonic() > self.deadline:
             self.found.complete = False
         return self.found.complete
@@ -251,7 +243,7 @@ class Search:
         kept: dict[tuple[Combination, int], Start] = {}
         near = [c for c in best if self.found.best(c) > top - _REACH][:_BASES]
         # What an error of the sensor hides, an effect less, shows where there is none.
-        plain = sorted(best, key=self._white, reverse=True)[:1]
+        plain = sorted(best, key=self.white, reverse=True)[:1]
         for k, c in enumerate(dict.fromkeys([*near, *plain])):
             white = self.found.of(c, "white")
             assert white is not None  # every combination is weighed under white noise first
@@ -308,14 +300,14 @@ class Search:
         return [start for alike in kept.values() for start in alike]
 
     def _from_nothing(self, combination: Combination) -> Start:
-        return Start(combination, self._from_seed(), 0.0)
+        return Start(combination, self.from_seed(), 0.0)
 
     def _weigh_in_batches(self, starts: Sequence[Start], whole: bool = False) -> None:
         """As many as there is time for."""
         if starts:
             self.progress(f"weighing {len({s.combination for s in starts})} combinations")
         for a in range(0, len(starts), _BATCH):
-            if self._in_time():
+            if self.in_time():
                 self.weigher.weigh(starts[a : a + _BATCH], whole=whole)
 
     def _adequate(self) -> Combination | None:
@@ -351,10 +343,10 @@ class Search:
         mine = [c for c in self.found.estimates if self._size(c) == size]
         return any(
             max(map(value, mine), default=-np.inf) > max(map(value, smaller)) + least
-            for value, least in ((self.found.best, _WORTH), (self._white, _REACH))
+            for value, least in ((self.found.best, _WORTH), (self.white, _REACH))
         )
 
-    def _white(self, combination: Combination) -> float:
+    def white(self, combination: Combination) -> float:
         """Log evidence of a combination under white noise alone."""
         one = self.found.of(combination, "white")
         return -np.inf if one is None else one.log_evidence
@@ -362,22 +354,22 @@ class Search:
     def _weigh_remainders(self) -> None:
         """Errors of the clock, and forces that go with place, beside the best combinations."""
         self.remainders.weigh_clocks()
-        if self.found.odds(self.base) < max(map(self.found.odds, self.found.estimates)) and self._in_time():
+        if self.found.odds(self.base) < max(map(self.found.odds, self.found.estimates)) and self.in_time():
             self.remainders.weigh_static()
 
     def _weigh_forces(self) -> None:
         """Best combinations again, each with a missing force beside it; only the very best where that needs none."""
         named = sorted((c for c in self.found.estimates if self._size(c)), key=self.found.odds, reverse=True)
-        self._add_forces(named[:1], 2)
+        self.add_forces(named[:1], 2)
         kinds = {e.kind: e.log_evidence for c in named[:1] for e in self.found.estimates[c]}
         if kinds.pop("force", -np.inf) > max(kinds.values(), default=np.inf):
-            self._add_forces(named[1 : KEPT // 2 if self.weigher.is_long else _FORCED], 2)
+            self.add_forces(named[1 : KEPT // 2 if self.weigher.is_long else _FORCED], 2)
 
     def _weigh_spells(self) -> None:
         """Forces that act for a while, where something was left out."""
         best, white = max(self.found.estimates, key=self.found.odds), self.found.of(self.base, "white")
         alone = -np.inf if white is None else white.log_evidence + self.found.prices.log(self.base)
-        if self.found.odds(best) > alone + _WORTH and self._in_time():
+        if self.found.odds(best) > alone + _WORTH and self.in_time():
             self.progress("weighing forces that act for a while")
             Spells(self.prospects, self.typical).weigh(best, _REACH)
 
@@ -386,7 +378,7 @@ class Search:
             self.progress("weighing the best combinations with every reading")
         self.weigher.weigh_with_outliers_in()
 
-    def _add_forces(self, combinations: Sequence[Combination], every: int) -> None:
+    def add_forces(self, combinations: Sequence[Combination], every: int) -> None:
         starts = []
         for c in combinations:
             white = self.found.of(c, "white")

@@ -9,6 +9,7 @@ import numpy as np
 import sympy
 from jaxtyping import Float
 
+from .._effects import Nameless
 from .._expression import Expression
 from .._kinks import Absolute, Sign
 from .._simulation_records import SimulationFile
@@ -27,14 +28,10 @@ _EXPLAINED = 0.2
 
 @dataclass(frozen=True)
 class Proposal:
-    """A force on one coordinate: its terms in the simulation's own names, what each is multiplied by, and how large
-    each is along the motion (root mean square)."""
+    """A force on one coordinate, with what each of its terms is multiplied by."""
 
-    coordinate: int
-    terms: tuple[sympy.Expr, ...]
+    force: Nameless
     sizes: tuple[float, ...]
-    spreads: tuple[float, ...]
-    choices: float  # log of how many such expressions the library holds
 
 
 def proposals(file: SimulationFile, outlooks: Sequence[Outlook], coordinates: Sequence[int]) -> list[Proposal]:
@@ -56,10 +53,9 @@ def proposals(file: SimulationFile, outlooks: Sequence[Outlook], coordinates: Se
     for i in coordinates:
         chosen, sizes, explained = stable_terms(values, push[:, i])
         if chosen and explained > _EXPLAINED:
-            spreads = tuple(float(x) for x in np.sqrt((values[:, chosen] ** 2).mean(0)))
             choices = float(np.log(math.comb(len(terms), len(chosen))))
-            some = tuple(terms[k] for k in chosen)
-            out.append(Proposal(i, some, tuple(float(x) for x in sizes), spreads, choices))
+            one = Nameless((i,), (tuple(terms[k] for k in chosen),), choices)
+            out.append(Proposal(one, tuple(float(x) for x in sizes)))
     return out
 
 

@@ -105,6 +105,8 @@ def finding_sentence(
     """
     said = Said(one, coefficients, units)
     opening = _OPENINGS[one.effect.name].format(q=one.targets[0], q2=one.targets[-1], side=_side(one))
+    if one.nameless is not None and one.nameless.words:
+        opening += f"; it {one.nameless.words}"
     words = [f"{opening}: {_law_with_numbers(said)}."]
     if only:
         words.append(f"It is in recording{'s' if len(only) > 1 else ''} {_listed([str(r) for r in only], 'and')} only.")

@@ -1,0 +1,77 @@
+"""Simple laws of force that have no word in the vocabulary: what a physicist would try next."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import sympy
+
+from .._effects import UNNAMED, Nameless
+from .._kinks import Absolute
+from .._simulation_records import SimulationFile
+from .._symbolic import derivative
+
+# Coordinates up to which forces between two of them are tried: there are twelve for every two.
+_FEW = 3
+# Keeps the slope of a speed a number at rest.
+_TINY = sympy.Float(1e-300)
+
+
+def laws(file: SimulationFile, first: float) -> list[Nameless]:
+    """Forces on coordinates, or between two, that the simulation may lack; none on one that has a force without a name
+    already, which a term of the file is. `first` is the time of the first row.
+
+    Powers of place and speed that the vocabulary does not have, damping that hangs on place, inertia that does;
+    energies and gyroscopic forces of two coordinates, what one of them does to the other and not back, and what goes
+    with the speed of both.
+    """
+    states, number = file.symbols, range(len(file.coordinates))
+    q = [states[name] for name in file.coordinates]
+    v = [derivative(file.hamiltonian.tree, states[p]) for p in file.momenta]
+    listed = [law for i in number for law in _own(i, file.coordinates[i], q[i], v[i], states["t"] - sympy.Float(first))]
+    if len(q) <= _FEW:
+        listed += [law for i, j in combinations(number, 2) for law in _between((i, j), file.coordinates, q, v)]
+    taken = {file.coordinates.index(t.target[0]) for t in file.terms if t.effect == UNNAMED.name}
+    some = [law for law in listed if not taken & set(law.places)]
+    return [replace(law, choices=float(np.log(len(some)))) for law in some]
+
+
+def _own(i: int, name: str, q: sympy.Expr, v: sympy.Expr, since: sympy.Expr) -> Iterator[Nameless]:
+    """On one coordinate by itself."""
+    for words, *terms in (
+        ("goes with the third power of its speed", v**3),
+        (f"goes with its speed and the square of {name}", q**2 * v),
+        (f"goes with its speed and {name}", q * v),
+        (f"goes with {name} and the square of its speed, as where the inertia hangs on place", q * v**2),
+        ("goes with the time since the start", since),
+        ("goes with place alone, by a curve", q**2, q**3, q**4, q**5),
+    ):
+        yield Nameless((i,), (tuple(terms),), words=words)
+
+
+def _between(
+    pair: tuple[int, int], names: tuple[str, ...], q: Sequence[sympy.Expr], v: Sequence[sympy.Expr]
+) -> Iterator[Nameless]:
+    """On two coordinates, or on one of them by the other."""
+    i, j = pair
+    a, b, first, second = q[i], q[j], names[i], names[j]
+    for energy, shown in (
+        (a * b**2, f"{first} {second}^2"),
+        (a**2 * b, f"{first}^2 {second}"),
+        (a**2 * b**2 / 2, f"{first}^2 {second}^2"),
+        ((a - b) ** 4 / 4, f"({first} - {second})^4"),
+    ):
+        pushes = (-derivative(energy, a),), (-derivative(energy, b),)
+        yield Nameless(pair, pushes, words=f"comes from a potential energy that goes with {shown}")
+    for place, name in ((a, first), (b, second)):
+        pushes = (place * v[j],), (-place * v[i],)
+        yield Nameless(pair, pushes, words=f"acts across the motion, with its speed and {name}")
+    apart, speed = v[i] - v[j], sympy.sqrt(v[i] ** 2 + v[j] ** 2 + _TINY)
+    drag = Absolute(apart) * apart
+    yield Nameless(pair, ((-drag,), (drag,)), words="acts between them with the square of their relative speed")
+    along = (-speed * v[i],), (-speed * v[j],)
+    yield Nameless(pair, along, words=f"acts along the motion in {first} and {second}, with the square of its speed")
+    for k, m in ((i, j), (j, i)):
+        yield Nameless((k,), ((q[m],),), words=f"goes with {names[m]}, which feels nothing of it")
+        yield Nameless((k,), ((v[m],),), words=f"goes with the speed of {names[m]}, which feels nothing of it")
