@@ -14,7 +14,7 @@ from symplearn.diagnosis._calibrate import calibrate
 from symplearn.diagnosis._clock import weigh_clock
 from symplearn.diagnosis._forecast import forecast
 from symplearn.diagnosis._outlook import Outlook
-from symplearn.diagnosis._positional import _Channel, weigh_positional
+from symplearn.diagnosis._positional import _Channel, _weighed, weigh_positional
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
 from symplearn.diagnosis._weighed import weigh_coloured, weigh_white
@@ -27,7 +27,7 @@ def test_polynomials_are_integrated_out(ratio):
     """Gram matrix and determinant are those of the dense covariance that independent coefficients give the errors."""
     rng = np.random.default_rng(1)
     columns = rng.normal(size=(4 + 3, 50))
-    one = _Channel(columns, 4, np.ones(50, bool), 0.7)
+    one = _Channel(columns, 4, np.ones(50, bool), 0.7, 1.0)
     # 1e-9 is round-off of two ways to solve with a matrix whose condition number is below 1000.
     covariance = np.eye(50) + ratio / 3 * columns[4:].T @ columns[4:]
     gram, log = one.marginal(ratio)
@@ -43,7 +43,9 @@ def test_the_error_is_what_a_dense_process_expects(ratio):
     seen, root = rng.uniform(-2.0, 3.0, 50), np.sqrt(rng.uniform(0.5, 20.0, 50))
     shapes = np.stack([np.sqrt(2 * k + 1) * Legendre.basis(k)(2 * (seen + 2) / 5 - 1) for k in range(13)])
     columns, column = rng.normal(size=(4, 50)) * root, rng.normal(size=4)
-    one = _Channel(np.concatenate([columns, shapes * root]), 4, np.ones(50, bool), 0.7, Shapes((-2.0, 3.0)))
+    one = _Channel(
+        np.concatenate([columns, shapes * root]), 4, np.ones(50, bool), 0.7, float((root**2).sum()), Shapes((-2.0, 3.0))
+    )
     found, prior = one.bend(column, ratio, 0.3), ratio / 13 * shapes.T @ shapes
     taken = prior @ np.linalg.inv(prior + np.diag(1 / root**2))
     # Here and below round-off of two ways to solve, with a matrix of condition 4000; times say nothing of it.
@@ -62,7 +64,7 @@ def read(q, scale):
     return q + scale * (3 * q**2 - 2 * q**4)
 
 
-def fitted(scale, errors=None, given=0.0, size=1.0, zero=0.0, hold=0.0):
+def fitted(scale, errors=None, given=0.0, size=1.0, zero=0.0, hold=0.0, read=read):
     """A spring, its stiffness calibrated, whose reading a sensor bends by `scale`, fitted; its noise is `given`, and
     said to be wrong, or not. It is read in units of `size` from `zero` on; a share is held out."""
     q = swing(TIMES)
@@ -111,6 +113,29 @@ def test_it_is_seen_wherever_and_in_whatever_unit_it_is_read(size, zero, bent_sc
     (white, _, bent), (plain, _, same) = bent_scale, evidences(0.03, size=size, zero=zero)
     # The fits stop where they promise less than half a nat, each on its own way.
     assert same.log_evidence - plain.log_evidence == pytest.approx(bent.log_evidence - white.log_evidence, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("read", "is_curve"),
+    [(lambda q, _: np.tanh(0.4 * q) / 0.4, True), (lambda q, _: q + 0.02 * np.sin(9 * q), False)],
+    ids=["saturating", "wavy"],
+)
+def test_a_scale_that_saturates_is_a_plain_curve(read, is_curve):
+    """A scale that saturates is likelier as a square and a cube than as many bends, one that waves as bends; what is
+    told has half of the prior of either."""
+    p, fits, priors = fitted(0.0, read=read)
+    rows = [p.rows[0].fitted]
+    (told,) = weigh_positional(p, fits, priors, rows)
+    curve, bends = (_weighed(p, fits, 0, priors, rows, False, way).log_evidence for way in (True, False))
+    assert told.log_evidence == pytest.approx(np.logaddexp(curve, bends) - np.log(2))
+    assert told.bends[0].shapes.curve == is_curve
+    # Seen: 13 nats for the curve, and 170 for the bends.
+    assert (curve - bends if is_curve else bends - curve) > 5
+    x = np.linspace(-0.8, 0.8, 50)
+    error = read(x, 0.0) - x - told.bends[0](x, x)
+    # What a start and a stiffness make up for, a shift and a factor, are left out. Seen: 0.001 and 0.003 at most.
+    rest = error - np.polyval(np.polyfit(x, error, 1), x)
+    assert np.abs(rest).max() < 0.01
 
 
 @pytest.mark.slow

@@ -7,35 +7,41 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.polynomial.legendre import legvander
 
-# Polynomials up to this degree.
-_DEGREE = 12
+# Polynomials up to this degree, as a worn track has another error at every place; or a plain curve, as of a scale that
+# saturates: the square and the cube, as what is constant or in proportion has a name of its own.
+_DEGREE, _CURVE = 12, (2, 3)
 
 
 @dataclass(frozen=True)
 class Shapes:
     """What such an error is a sum of: polynomials over the range of what is read, and with `speeds` over that of its
-    rate of change too."""
+    rate of change too; a plain `curve` of both, or one of many bends."""
 
     readings: tuple[float, float]
     speeds: tuple[float, float] | None = None
+    curve: bool = False
 
     @classmethod
     def over(
         cls, expected: Sequence[Float[np.ndarray, " _"]], times: Sequence[Float[np.ndarray, " _"]],
-        seen: Bool[np.ndarray, " row"], moving: bool,
+        seen: Bool[np.ndarray, " row"], moving: bool, curve: bool = False,
     ) -> "Shapes":  # fmt: skip
         """Those of what is read in some recordings, end to end, and with `moving` of its rates."""
         speeds = [rate(x, t) for x, t in zip(expected, times, strict=True)]
-        return cls(_ends(np.concatenate(expected), seen), _ends(np.concatenate(speeds), seen) if moving else None)
+        ends = _ends(np.concatenate(expected), seen), _ends(np.concatenate(speeds), seen) if moving else None
+        return cls(*ends, curve)
 
     def __call__(
         self, expected: Float[np.ndarray, "*batch row"], times: Float[np.ndarray, " row"]
     ) -> Float[np.ndarray, "*batch row shape"]:
-        shapes = polynomials(expected, *self.readings)
+        some = curves if self.curve else polynomials
+        shapes = some(expected, *self.readings)
         if self.speeds is None:
             return shapes
         # A constant error is among those of place.
-        return np.concatenate([shapes, polynomials(rate(expected, times), *self.speeds)[..., 1:]], axis=-1)
+        return np.concatenate(
+            [shapes, some(rate(expected, times), *self.speeds)[..., 0 if self.curve else 1 :]], axis=-1
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +68,21 @@ def bent(
                           for j, one in enumerate(bends))  # fmt: skip
 
 
+def curves(expected: Float[np.ndarray, "*row"], low: float, high: float) -> Float[np.ndarray, "*row power"]:
+    """The square and the cube, counted from the middle of a range, of mean square one over it."""
+    place = _place(expected, low, high)
+    return np.stack([place**k * np.sqrt(2 * k + 1) for k in _CURVE], axis=-1)
+
+
 def polynomials(expected: Float[np.ndarray, "*row"], low: float, high: float) -> Float[np.ndarray, "*row degree"]:
     """Legendre's, orthonormal over a range; beyond, they stay as at its end."""
-    place = np.clip(2 * (expected - low) / max(high - low, 1e-300) - 1, -1.0, 1.0)
-    shapes: np.ndarray = legvander(np.nan_to_num(place), _DEGREE) * np.sqrt(2 * np.arange(_DEGREE + 1) + 1)
+    shapes: np.ndarray = legvander(_place(expected, low, high), _DEGREE) * np.sqrt(2 * np.arange(_DEGREE + 1) + 1)
     return shapes
+
+
+def _place(expected: Float[np.ndarray, "*row"], low: float, high: float) -> Float[np.ndarray, "*row"]:
+    """Where in a range something is, from -1 to 1."""
+    return np.nan_to_num(np.clip(2 * (expected - low) / max(high - low, 1e-300) - 1, -1.0, 1.0))
 
 
 def rate(

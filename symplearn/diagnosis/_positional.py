@@ -8,7 +8,7 @@ What a camera sees or a gear with play turns is off by another amount on the way
 reading's rate of change as well (the kind `kinematic`), by polynomials of that.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -35,6 +35,7 @@ class _Channel:
     plain: int  # columns that are no shapes
     seen: Bool[np.ndarray, " row"]
     log_weights: float
+    total: float  # of all weights
     shapes: Shapes = Shapes((0.0, 1.0))
 
     @property
@@ -49,10 +50,30 @@ class _Channel:
 
     def marginal(self, ratio: float) -> tuple[np.ndarray, float]:
         """Gram matrix of the plain columns with the shapes integrated out, and the log determinant they leave."""
-        number = len(self.columns) - self.plain
-        unit = np.where(np.arange(len(self.columns)) < self.plain, 1.0, np.sqrt(ratio / number))
-        gram, _, log = amplitudes_out(self.gram * np.outer(unit, unit), self.plain)
+        return self._marginal(self.gram, self.plain, ratio)
+
+    def _marginal(self, gram: Float[np.ndarray, "column column"], plain: int, ratio: float) -> tuple[np.ndarray, float]:
+        unit = np.where(np.arange(len(gram)) < plain, 1.0, np.sqrt(ratio / (len(gram) - plain)))
+        gram, _, log = amplitudes_out(gram * np.outer(unit, unit), plain)
         return gram, log - self.log_weights
+
+    def left(self, precision: Float[np.ndarray, " plain"]) -> Callable[[float], tuple[float, float]]:
+        """By ratio, the squared error that unknowns of some precisions cannot make up for, by one reading's noise, and
+        that log determinant; those of infinite precision are known."""
+        free = 1 + np.flatnonzero(np.isfinite(precision))
+        rest = np.concatenate([[0], np.arange(self.plain, len(self.columns))])
+        held = self.gram[np.ix_(free, free)] + np.diag(precision[free - 1])
+        # An unknown that does nothing, of no precision, makes up for nothing.
+        held += np.diag(np.where(np.diagonal(held) > 0, 0.0, 1.0))
+        gram, cross = self.gram[np.ix_(rest, rest)], self.gram[np.ix_(free, rest)]
+        if np.isfinite(self.gram).all():  # of a trajectory that has not run away
+            gram = gram - cross.T @ np.linalg.lstsq(held, cross)[0]
+
+        def value(ratio: float) -> tuple[float, float]:
+            found, log = self._marginal(gram, 1, ratio)
+            return float(found[0, 0]), log
+
+        return value
 
     def cleared(self, ratio: float) -> Float[np.ndarray, "column row"]:
         """The plain columns without what the shapes take of them."""
@@ -66,7 +87,7 @@ class _Channel:
         rest = self.columns[self.plain :]
         spread = np.linalg.inv(rest @ rest.T + np.eye(len(rest)) * len(rest) / ratio)
         mean = spread @ (rest @ (column @ self.columns[: self.plain]))
-        square = float((rest * (spread @ rest)).sum()) / max(float((rest[0] ** 2).sum()), 1e-300)
+        square = float((rest * (spread @ rest)).sum()) / max(self.total, 1e-300)
         return Bend(self.shapes, mean, noise * float(np.sqrt(max(square, 0.0))))
 
 
@@ -75,36 +96,51 @@ def weigh_positional(
     problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int], moving: bool = False
 ) -> list[Estimate]:
     """Estimates where each channel's error goes with what it reads, about the trajectory fit; with `moving` with how
-    fast that changes, too.
+    fast that changes, too: by a plain curve or by one of many bends, each as likely as the other.
 
     Of a combination with a wrongly given noise, too: no such error is as rough as noise.
     """
     out = []
-    for b, combination in enumerate(fits.combinations):
-        known = problem.noise_of(combination)
-        channels = [_channel(problem, fits, b, rows, j, moving) for j in range(problem.channels)]
-        ratios, occam = borne([_sizes(problem, one, j, known[j]) for j, one in enumerate(channels)])
-        both = [one.marginal(ratio) for one, ratio in zip(channels, ratios, strict=True)]
-        grams, logs = np.stack([gram for gram, _ in both]), np.array([log for _, log in both])
-        number = np.array([one.number for one in channels])
-        one = correlated(problem, fits, b, grams, logs, number, occam, priors)
-        told = _told(problem, one, fits.z[b], channels, ratios, grams)
-        out.append(replace(told, kind="kinematic" if moving else "positional"))
+    for b in range(len(fits.combinations)):
+        ways = [_weighed(problem, fits, b, priors, rows, moving, curve) for curve in (True, False)]
+        values = np.nan_to_num([one.log_evidence for one in ways], nan=-np.inf)
+        value = float(np.logaddexp.reduce(values)) - float(np.log(len(ways)))
+        out.append(replace(ways[int(values.argmax())], log_evidence=value))
     return out
 
 
-def _channel(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int, moving: bool) -> _Channel:
+def _weighed(
+    problem: Problem, fits: Fits, b: int, priors: Priors, rows: Sequence[int], moving: bool, curve: bool
+) -> Estimate:
+    """The same by a plain `curve`, or by one of many bends."""
+    combination, active = fits.combinations[b], problem.active(fits.combinations[b])
+    known, precision = problem.noise_of(combination), priors.precision_of(problem, combination)
+    channels = [_channel(problem, fits, b, rows, j, moving, curve) for j in range(problem.channels)]
+    held = [np.where(active, precision * noise**2, np.inf) for noise in fits.noise[b]]
+    each = zip(channels, known, held, strict=True)
+    ratios, occam = borne([_sizes(problem, one, j, sd, free) for j, (one, sd, free) in enumerate(each)])
+    both = [one.marginal(ratio) for one, ratio in zip(channels, ratios, strict=True)]
+    grams, logs = np.stack([gram for gram, _ in both]), np.array([log for _, log in both])
+    number = np.array([one.number for one in channels])
+    one = correlated(problem, fits, b, grams, logs, number, occam, priors)
+    told = _told(problem, one, fits.z[b], channels, ratios, grams)
+    return replace(told, kind="kinematic" if moving else "positional")
+
+
+def _channel(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int, moving: bool, curve: bool) -> _Channel:
     weight = weights(problem, rows)
     expected, times = [p.readings[b, :, j] for p in fits.predictions], _times(problem, weight)
     seen, parts = np.concatenate([w[:, j] > 0 for w in weight]), []
-    shapes = Shapes.over(expected, times, seen, moving)
+    shapes = Shapes.over(expected, times, seen, moving, curve)
     for r, (x, w) in enumerate(zip(residuals(problem, fits.predictions, weight), weight, strict=True)):
         slopes = np.zeros((problem.size, len(w)))
         slopes[problem.local(r)] = fits.predictions[r].slopes[b, :, :, j]
         parts.append(np.concatenate([x[b, None, :, j], slopes, shapes(expected[r], times[r]).T]))
     root = np.sqrt(np.concatenate([w[:, j] for w in weight]))
     columns = np.where(seen, np.concatenate(parts, axis=1), 0.0) * root
-    return _Channel(columns, 1 + problem.size, seen, float(2 * np.log(root[seen]).sum()), shapes)
+    return _Channel(
+        columns, 1 + problem.size, seen, float(2 * np.log(root[seen]).sum()), float((root[seen] ** 2).sum()), shapes
+    )
 
 
 def _times(problem: Problem, weight: Sequence[np.ndarray]) -> list[Float[np.ndarray, " _"]]:
@@ -114,11 +150,12 @@ def _times(problem: Problem, weight: Sequence[np.ndarray]) -> list[Float[np.ndar
 def whitened_along(
     columns: Sequence[Float[np.ndarray, "column _"]], shown: Sequence[Float[np.ndarray, " _"]],
     times: Sequence[Float[np.ndarray, " _"]], weight: Sequence[Float[np.ndarray, " _"]], ratio: float, moving: bool,
+    curve: bool,
 ) -> list[Float[np.ndarray, "column _"]]:  # fmt: skip
     """One channel's columns, by recording, whitened beside an error that goes with what is read: the noise's variance
     and that of `ratio` times its size together. `shown` are the expected readings."""
     w, every = np.concatenate(weight), np.concatenate(columns, axis=1)
-    shapes = Shapes.over(shown, times, w > 0, moving)
+    shapes = Shapes.over(shown, times, w > 0, moving, curve)
     whole = np.concatenate([shapes(x, t) for x, t in zip(shown, times, strict=True)])
     rest = np.where(w > 0, whole.T, 0.0) * np.sqrt(w)
     _, sizes, ways = np.linalg.svd(rest, full_matrices=False)
@@ -128,14 +165,12 @@ def whitened_along(
     return np.split(done, np.cumsum([len(one) for one in weight])[:-1], axis=1)
 
 
-def _sizes(problem: Problem, one: _Channel, j: int, known: float) -> Sizes:
-    """Variances of the error against the noise's, which may be known."""
-    bare = replace(one, columns=np.concatenate([one.columns[:1], one.columns[one.plain :]]), plain=1)
-    most = largest(problem, j)
+def _sizes(problem: Problem, one: _Channel, j: int, known: float, precision: Float[np.ndarray, " plain"]) -> Sizes:
+    """Variances of the error against the noise's, which may be known, beside unknowns of some precisions."""
+    left, most = one.left(precision), largest(problem, j)
 
     def value(ratio: float) -> float:
-        gram, log = bare.marginal(ratio)
-        return log_likelihood(Left(float(gram[0, 0]), log), one.number, known, ratio, most)
+        return log_likelihood(Left(*left(ratio)), one.number, known, ratio, most)
 
     return sizes(value, _RATIOS)
 

@@ -48,4 +48,5 @@ def _channel(
         return [whitened_series(x, w, t, estimate.colours[j]).T for x, w, t in zip(columns, own, times, strict=True)]
     if estimate.kind == "clock":
         return whitened_beside(columns, shown, own, times, (estimate.colours[j], estimate.clocks[j]))
-    return whitened_along(columns, shown, times, own, estimate.bent[j], estimate.kind == "kinematic")
+    curve = bool(estimate.bends) and estimate.bends[j].shapes.curve
+    return whitened_along(columns, shown, times, own, estimate.bent[j], estimate.kind == "kinematic", curve)
