@@ -1,13 +1,11 @@
 """Simple laws of force that have no word in the vocabulary: what a physicist would try next."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import combinations
 
-import numpy as np
 import sympy
 
-from .._effects import UNNAMED, Nameless
+from .._effects import Nameless
 from .._kinks import Absolute
 from .._simulation_records import SimulationFile
 from .._symbolic import derivative
@@ -19,8 +17,7 @@ _TINY = sympy.Float(1e-300)
 
 
 def laws(file: SimulationFile, first: float) -> list[Nameless]:
-    """Forces on coordinates, or between two, that the simulation may lack; none on one that has a force without a name
-    already, which a term of the file is. `first` is the time of the first row.
+    """Forces on coordinates, or between two, that the simulation may lack; `first` is the time of the first row.
 
     Powers of place and speed that the vocabulary does not have, damping that hangs on place, inertia that does;
     energies and gyroscopic forces of two coordinates, what one of them does to the other and not back, and what goes
@@ -29,12 +26,11 @@ def laws(file: SimulationFile, first: float) -> list[Nameless]:
     states, number = file.symbols, range(len(file.coordinates))
     q = [states[name] for name in file.coordinates]
     v = [derivative(file.hamiltonian.tree, states[p]) for p in file.momenta]
-    listed = [law for i in number for law in _own(i, file.coordinates[i], q[i], v[i], states["t"] - sympy.Float(first))]
+    since = states["t"] - sympy.Float(first)
+    listed = [law for i in number for law in _own(i, file.coordinates[i], q[i], v[i], since)]
     if len(q) <= _FEW:
-        listed += [law for i, j in combinations(number, 2) for law in _between((i, j), file.coordinates, q, v)]
-    taken = {file.coordinates.index(t.target[0]) for t in file.terms if t.effect == UNNAMED.name}
-    some = [law for law in listed if not taken & set(law.places)]
-    return [replace(law, choices=float(np.log(len(some)))) for law in some]
+        listed += [law for pair in combinations(number, 2) for law in _between(pair, file.coordinates, q, v)]
+    return listed
 
 
 def _own(i: int, name: str, q: sympy.Expr, v: sympy.Expr, since: sympy.Expr) -> Iterator[Nameless]:

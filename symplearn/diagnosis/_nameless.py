@@ -1,9 +1,11 @@
 """Forces without a name, weighed beside what was found with one: simple laws, and expressions of the missing force."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
+from dataclasses import replace
 
 import numpy as np
 import sympy
+from jaxtyping import Float
 
 from .._effects import UNNAMED, Nameless
 from .._recording import Recording
@@ -39,12 +41,16 @@ _LATER = ("clock", "static", "force", "spell")
 
 def weigh_nameless(file: SimulationFile, recordings: Sequence[Recording], options: Options, search: Search) -> None:
     """Where something is missing, weigh forces that have no word beside those that do: simple laws; and where nothing
-    fits then, expressions that were fitted to the missing force."""
+    fits then, expressions that were fitted to the missing force. None on a coordinate that a term of the file without a
+    name pushes already (contract, section 4)."""
     if not options.restriction.has(UNNAMED) or not search.in_time() or _odds(search).as_it_is >= CONSISTENT:
         return
     options.progress("weighing laws of force without a name")
+    taken = {file.coordinates.index(term.target[0]) for term in file.terms if term.effect == UNNAMED.name}
     begun = _Extended(file, recordings, options, search)
-    if known := begun.usable(laws(file, float(recordings[0].times[0]))):
+    listed = begun.usable(laws(file, float(recordings[0].times[0])), taken)
+    known = [replace(law, choices=float(np.log(len(listed)))) for law in listed]
+    if known:
         begun.extend(known)
         _weigh_laws(search, [m for m, _ in begun.members(known)])
     pull = search.found.of(search.base, "force")
@@ -55,9 +61,10 @@ def weigh_nameless(file: SimulationFile, recordings: Sequence[Recording], option
     if not all(o.ok for o in outlooks):
         return
     some = proposals(file, outlooks, strained_coordinates(outlooks))[: MOST - len(search.base)]
-    if listed := [one for one in some if begun.usable([one.force])]:
-        begun.extend([*known, *(one.force for one in listed)])
-        _weigh_proposals(search, begun, listed)
+    usable = begun.usable([one.force for one in some], taken)
+    if proposed := [one for one in some if one.force in usable]:
+        begun.extend([*known, *(one.force for one in proposed)])
+        _weigh_proposals(search, begun, proposed)
 
 
 class _Extended:
@@ -66,9 +73,10 @@ class _Extended:
     def __init__(self, file: SimulationFile, recordings: Sequence[Recording], options: Options, search: Search):
         self.file, self.recordings, self.options, self.search = file, recordings, options, search
 
-    def usable(self, forces: Sequence[Nameless]) -> list[Nameless]:
-        """Those that are somewhere along the recorded motion, and no numbers nowhere."""
-        return [force for force in forces if np.isfinite(self._scales(force)).all()]
+    def usable(self, forces: Sequence[Nameless], taken: Container[int]) -> list[Nameless]:
+        """Those that are a number along the recorded motion, and somewhere not zero, on coordinates that are free."""
+        scales = zip(forces, self._scales(forces), strict=True)
+        return [one for one, scale in scales if np.isfinite(scale).all() and not any(i in taken for i in one.places)]
 
     def extend(self, forces: Sequence[Nameless]) -> None:
         """Let the search go on with these, of which the first ones may be known to it."""
@@ -78,7 +86,7 @@ class _Extended:
         built = augmented_equations(self.file, first, restriction, middle, forces)
         longest = float(np.max(problem.rows[0].spans.step)) * (1 + 1e-9)
         problem = build(self.file, built, self.recordings, self.options.holdout, longest, restriction)
-        scales = [scale for force in forces for scale in self._scales(force)]
+        scales = [float(x) for each in self._scales(forces) for x in each]
         search.goes_on(Stepper(problem, self.options.jobs), with_nameless(problem, search.found.priors, scales))
 
     def members(self, forces: Sequence[Nameless]) -> list[tuple[int, Nameless]]:
@@ -86,16 +94,18 @@ class _Extended:
         number = len(self.search.problem.equations.candidates)
         return list(zip(range(number - len(forces), number), forces, strict=True))
 
-    def _scales(self, force: Nameless) -> list[float]:
-        """Prior scales of its amplitudes: as strong as every other effect where it is strongest."""
-        typical = self.search.typical
-        with np.errstate(all="ignore"):
-            each = [
-                STRENGTH * typical[i] / self._sizes(terms) for i, terms in zip(force.places, force.pushes, strict=True)
-            ]
-        return [float(x) for x in np.min(each, axis=0)]
+    def _scales(self, forces: Sequence[Nameless]) -> list[Float[np.ndarray, " amplitude"]]:
+        """Prior scales of their amplitudes: as strong as every other effect where it is strongest."""
+        sizes = iter(self._sizes([term for force in forces for terms in force.pushes for term in terms]))
+        out = []
+        with np.errstate(divide="ignore"):
+            for force in forces:
+                each = [[self.search.typical[i] / next(sizes) for _ in terms]
+                        for i, terms in zip(force.places, force.pushes, strict=True)]  # fmt: skip
+                out.append(STRENGTH * np.min(each, axis=0))
+        return out
 
-    def _sizes(self, terms: Sequence[sympy.Expr]) -> np.ndarray:
+    def _sizes(self, terms: Sequence[sympy.Expr]) -> Float[np.ndarray, " term"]:
         """Root mean squares of terms along the motion that every prior of an effect comes from."""
         problem, (z, paths), columns = self.search.problem, self.search.likely, []
         d, width = len(self.file.coordinates), problem.equations.width
@@ -111,16 +121,17 @@ def _weigh_laws(search: Search, members: Sequence[int]) -> None:
     beside the best law; and what is like the best of them beside every remainder."""
     found, near = search.found, _is_near(search)
     starts = _promising(search, members)
-    if not near:  # a regression about what is far off says little of where a fit begins
-        alone = [s.combination for s in starts if len(s.combination) == len(search.base) + 1]
-        search.weigher.weigh([Start(c, search.from_seed(), 0.0) for c in alone]) if alone else None
+    alone = [s.combination for s in starts if len(s.combination) == len(search.base) + 1]
+    if alone and not near:  # a regression about what is far off says little of where a fit begins
+        search.weigher.weigh([Start(c, search.from_seed(), 0.0) for c in alone])
     if starts:
         search.weigher.weigh(starts, whole=True)
     best = max(found.estimates, key=found.odds)
     if set(best) & set(members) and len(best) < MOST and search.in_time():
         further = sorted(search.prospects.about(best, _PLACES), key=lambda s: -s.gain - found.prices.log(s.combination))
         more = [s for s in further if s.gain > _WORTH and s.combination not in found.estimates][:_BESIDE]
-        search.weigher.weigh(more, whole=True) if more else None
+        if more:
+            search.weigher.weigh(more, whole=True)
         search.refinement.weigh_subsets()
     _weigh_beside_remainders(search, members)
 
