@@ -93,14 +93,14 @@ def test_every_law_between_two_is_what_it_says():
             assert (abs(number[0] + number[1]) < 1e-12) == (kind == "between")
         else:
             assert len(law.places) == 1
-    assert kinds == {"potential": 4, "across": 2, "between": 1, "along": 1, "own or one-sided": 16}
+    assert kinds == {"potential": 4, "across": 2, "between": 1, "along": 1, "own or one-sided": 18}
 
 
 def test_laws_share_the_share_of_what_has_no_name():
     """All laws together have one family's share of the prior, and of two on one coordinate a combination has one."""
     file, times = two(), np.linspace(0.0, 5.0, 30)
     run = cases.recorded(times, np.cos(np.stack([times, times], axis=1)), columns=("a", "b"))
-    every = [replace(law, choices=np.log(24)) for law in laws(file, 0.0)]
+    every = [replace(law, choices=np.log(26)) for law in laws(file, 0.0)]
     problem = build(file, augmented_equations(file, nameless=every), [run], 0.0, 0.1, Restriction())
     members = range(len(problem.equations.candidates) - len(every), len(problem.equations.candidates))
     prices = Prices(problem)

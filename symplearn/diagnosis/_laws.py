@@ -35,15 +35,16 @@ def laws(file: SimulationFile, first: float) -> list[Nameless]:
 
 def _own(i: int, name: str, q: sympy.Expr, v: sympy.Expr, since: sympy.Expr) -> Iterator[Nameless]:
     """On one coordinate by itself."""
-    for words, *terms in (
+    for words, term in (
         ("goes with the third power of its speed", v**3),
         (f"goes with its speed and the square of {name}", q**2 * v),
         (f"goes with its speed and {name}", q * v),
         (f"goes with {name} and the square of its speed, as where the inertia hangs on place", q * v**2),
         ("goes with the time since the start", since),
-        ("goes with place alone, by a curve", q**2, q**3, q**4, q**5),
+        (f"goes with the fourth power of {name}", q**4),
+        (f"goes with the fifth power of {name}", q**5),
     ):
-        yield Nameless((i,), (tuple(terms),), words=words)
+        yield Nameless((i,), ((term,),), words=words)
 
 
 def _between(
