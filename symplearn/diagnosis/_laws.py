@@ -1,8 +1,10 @@
 """Simple laws of force that have no word in the vocabulary: what a physicist would try next."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import combinations
 
+import numpy as np
 import sympy
 
 from .._effects import Nameless
@@ -12,6 +14,8 @@ from .._symbolic import derivative
 
 # Coordinates up to which forces between two of them are tried: there are twelve for every two.
 _FEW = 3
+# Share of the prior of what has no name that simple laws have; the rest is of what none of them tells.
+_SHARE = 0.5
 # Keeps the slope of a speed a number at rest.
 _TINY = sympy.Float(1e-300)
 
@@ -33,6 +37,11 @@ def laws(file: SimulationFile, first: float) -> list[Nameless]:
     return listed
 
 
+def priced(listed: Sequence[Nameless]) -> list[Nameless]:
+    """The same, each of which is one choice of all: together they have a share of what has no name."""
+    return [replace(law, choices=float(np.log(len(listed) / _SHARE))) for law in listed]
+
+
 def _own(i: int, name: str, q: sympy.Expr, v: sympy.Expr, since: sympy.Expr) -> Iterator[Nameless]:
     """On one coordinate by itself."""
     for words, term in (
@@ -41,7 +50,6 @@ def _own(i: int, name: str, q: sympy.Expr, v: sympy.Expr, since: sympy.Expr) -> 
         (f"goes with its speed and {name}", q * v),
         (f"goes with {name} and the square of its speed, as where the inertia hangs on place", q * v**2),
         ("goes with the time since the start", since),
-        (f"goes with the fourth power of {name}", q**4),
         (f"goes with the fifth power of {name}", q**5),
     ):
         yield Nameless((i,), ((term,),), words=words)

@@ -1,7 +1,6 @@
 """Forces without a name, weighed beside what was found with one: simple laws, and expressions of the missing force."""
 
 from collections.abc import Container, Sequence
-from dataclasses import replace
 
 import numpy as np
 import sympy
@@ -13,7 +12,7 @@ from .._simulation_records import SimulationFile
 from ._build import augmented_equations, build
 from ._effect_priors import STRENGTH, with_nameless
 from ._found import Found
-from ._laws import laws
+from ._laws import laws, priced
 from ._locate import strained_coordinates
 from ._options import Options
 from ._outlook import Outlook
@@ -48,9 +47,7 @@ def weigh_nameless(file: SimulationFile, recordings: Sequence[Recording], option
     options.progress("weighing laws of force without a name")
     taken = {file.coordinates.index(term.target[0]) for term in file.terms if term.effect == UNNAMED.name}
     begun = _Extended(file, recordings, options, search)
-    listed = begun.usable(laws(file, float(recordings[0].times[0])), taken)
-    known = [replace(law, choices=float(np.log(len(listed)))) for law in listed]
-    if known:
+    if known := priced(begun.usable(laws(file, float(recordings[0].times[0])), taken)):
         begun.extend(known)
         _weigh_laws(search, [m for m, _ in begun.members(known)])
     pull = search.found.of(search.base, "force")
