@@ -20,8 +20,8 @@ _SHARE = 0.5
 _TINY = sympy.Float(1e-300)
 
 
-def laws(file: SimulationFile, first: float) -> list[Nameless]:
-    """Forces on coordinates, or between two, that the simulation may lack; `first` is the time of the first row.
+def laws(file: SimulationFile) -> list[Nameless]:
+    """Forces on coordinates, or between two, that the simulation may lack.
 
     Powers of place and speed that the vocabulary does not have, damping that hangs on place, inertia that does;
     energies and gyroscopic forces of two coordinates, what one of them does to the other and not back, and what goes
@@ -30,8 +30,7 @@ def laws(file: SimulationFile, first: float) -> list[Nameless]:
     states, number = file.symbols, range(len(file.coordinates))
     q = [states[name] for name in file.coordinates]
     v = [derivative(file.hamiltonian.tree, states[p]) for p in file.momenta]
-    since = states["t"] - sympy.Float(first)
-    listed = [law for i in number for law in _own(i, file.coordinates[i], q[i], v[i], since)]
+    listed = [law for i in number for law in _own(i, file.coordinates[i], q[i], v[i])]
     if len(q) <= _FEW:
         listed += [law for pair in combinations(number, 2) for law in _between(pair, file.coordinates, q, v)]
     return listed
@@ -42,14 +41,13 @@ def priced(listed: Sequence[Nameless]) -> list[Nameless]:
     return [replace(law, choices=float(np.log(len(listed) / _SHARE))) for law in listed]
 
 
-def _own(i: int, name: str, q: sympy.Expr, v: sympy.Expr, since: sympy.Expr) -> Iterator[Nameless]:
+def _own(i: int, name: str, q: sympy.Expr, v: sympy.Expr) -> Iterator[Nameless]:
     """On one coordinate by itself."""
     for words, term in (
         ("goes with the third power of its speed", v**3),
         (f"goes with its speed and the square of {name}", q**2 * v),
         (f"goes with its speed and {name}", q * v),
         (f"goes with {name} and the square of its speed, as where the inertia hangs on place", q * v**2),
-        ("goes with the time since the start", since),
         (f"goes with the fifth power of {name}", q**5),
     ):
         yield Nameless((i,), ((term,),), words=words)

@@ -47,7 +47,7 @@ def weigh_nameless(file: SimulationFile, recordings: Sequence[Recording], option
     options.progress("weighing laws of force without a name")
     taken = {file.coordinates.index(term.target[0]) for term in file.terms if term.effect == UNNAMED.name}
     begun = _Extended(file, recordings, options, search)
-    if known := priced(begun.usable(laws(file, float(recordings[0].times[0])), taken)):
+    if known := priced(begun.usable(laws(file), taken)):
         begun.extend(known)
         _weigh_laws(search, [m for m, _ in begun.members(known)])
     pull = search.found.of(search.base, "force")
