@@ -15,7 +15,7 @@ _DEGREE, _CURVE = 12, (2, 3)
 @dataclass(frozen=True)
 class Shapes:
     """What such an error is a sum of: polynomials over the range of what is read, and with `speeds` over that of its
-    rate of change too; a plain `curve` of both, or one of many bends."""
+    rate of change too; or a plain `curve` over the former."""
 
     readings: tuple[float, float]
     speeds: tuple[float, float] | None = None
@@ -34,14 +34,13 @@ class Shapes:
     def __call__(
         self, expected: Float[np.ndarray, "*batch row"], times: Float[np.ndarray, " row"]
     ) -> Float[np.ndarray, "*batch row shape"]:
-        some = curves if self.curve else polynomials
-        shapes = some(expected, *self.readings)
+        if self.curve:
+            return curves(expected, *self.readings)
+        shapes = polynomials(expected, *self.readings)
         if self.speeds is None:
             return shapes
         # A constant error is among those of place.
-        return np.concatenate(
-            [shapes, some(rate(expected, times), *self.speeds)[..., 0 if self.curve else 1 :]], axis=-1
-        )
+        return np.concatenate([shapes, polynomials(rate(expected, times), *self.speeds)[..., 1:]], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,14 +95,15 @@ class _Channel:
 def weigh_positional(
     problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int], moving: bool = False
 ) -> list[Estimate]:
-    """Estimates where each channel's error goes with what it reads, about the trajectory fit; with `moving` with how
-    fast that changes, too: by a plain curve or by one of many bends, each as likely as the other.
+    """Estimates where each channel's error goes with what it reads, about the trajectory fit: by a plain curve or by
+    one of many bends, each as likely as the other; with `moving` with how fast that changes, too, by many bends.
 
     Of a combination with a wrongly given noise, too: no such error is as rough as noise.
     """
     out = []
     for b in range(len(fits.combinations)):
-        ways = [_weighed(problem, fits, b, priors, rows, moving, curve) for curve in (True, False)]
+        curves = (False,) if moving else (True, False)
+        ways = [_weighed(problem, fits, b, priors, rows, moving, curve) for curve in curves]
         values = np.nan_to_num([one.log_evidence for one in ways], nan=-np.inf)
         value = float(np.logaddexp.reduce(values)) - float(np.log(len(ways)))
         out.append(replace(ways[int(values.argmax())], log_evidence=value))
