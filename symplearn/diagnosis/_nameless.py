@@ -205,13 +205,14 @@ def _odds(search: Search) -> Posterior:
 
 
 def _is_open(odds: Posterior, found: Found) -> bool:
-    """Whether no name fits, or the best ones are many or leave a clear remainder beside them."""
+    """Whether no name fits and no law, or the best ones are many or leave a clear remainder beside them."""
     if odds.as_it_is >= CONSISTENT:
         return False
     if not odds.named or odds.unexplained >= odds.named[0].probability:
         return True
     best = odds.named[0].best
-    return len(best.combination) == MOST or is_clear(found, best)
+    has_law = any(found.problem.candidate(m).nameless for m in best.combination)
+    return not has_law and (len(best.combination) == MOST or is_clear(found, best))
 
 
 def is_clear(found: Found, best: Estimate) -> bool:
