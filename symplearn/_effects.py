@@ -190,13 +190,15 @@ class Nameless:
 
     **Arguments:** - `places`: numbers of the coordinates that it acts on. - `pushes`: its terms on each of them; terms
     of one number have one size. - `choices`: the logarithm of how many forces it was chosen from. - `words`: what it
-    does, as in "goes with ..."; empty where only its expression tells.
+    does, as in "goes with ..."; empty where only its expression tells. - `kind`: the family of the vocabulary that it
+    would be of where its size is positive; empty where of none.
     """
 
     places: tuple[int, ...]
     pushes: tuple[tuple[sympy.Expr, ...], ...]
     choices: float = 0.0
     words: str = ""
+    kind: str = ""
 
     def on(self, place: int) -> "Nameless":
         """What it is on one of its coordinates."""

@@ -19,6 +19,11 @@ def two():
     return cases.simulation(TWO, ["x1", "x2"], ["p1", "p2"], {"a": "x1", "b": "x2"}, "[parameters]\nm = 2.0")
 
 
+def found_likely(told):
+    """Families that are likelier than not."""
+    return [family for family, p in told.document["family_probability"].items() if p > 0.5]
+
+
 def value(text, **states):
     """A finding's expression in numbers, by SymPy alone."""
     return float(sympy.sympify(text).subs(states))
@@ -35,6 +40,7 @@ def test_a_drag_with_the_third_power_of_the_speed_is_no_quadratic_drag():
     told = diagnose(cases.simulation("p**2/2 + q**2/2"), runs, some)
     (finding,) = told.document["findings"]
     assert (finding["effect"], finding["target"], finding["family"]) == ("unnamed_force", "q", "any")
+    assert told.document["family_probability"]["dissipation"] > 0.95 and "activity" not in found_likely(told)
     assert finding["probability"] > 0.95 and 0.0 < finding["relative_sd"] < 0.1
     # A swing does not tell v^3 from q^2 v of three times the size, so what is compared is the power over a swing.
     angle = np.linspace(0.0, 2 * np.pi, 100, endpoint=False)
@@ -63,6 +69,7 @@ def test_an_energy_of_both_coordinates_is_one_force_on_each():
             assert value(one["coefficients"]["expression"], x1=a, x2=b) == pytest.approx(slope(a, b), abs=0.01)
         assert "potential energy that goes with x1^2 x2" in one["sentence"]
     assert {(one.effect, one.target) for one in told.augmented.terms} == {("unnamed_force", (q,)) for q in ("x1", "x2")}
+    assert set(found_likely(told)) == {"any", "conservative"}
     listed = [tuple(one["target"] for one in row["findings"]) for row in told.document["alternatives"]]
     assert all(isinstance(target, str | list) for row in listed for target in row)
     assert told.document["location"]["targets"] == ["x1", "x2"]

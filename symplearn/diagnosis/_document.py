@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from .._effects import Candidate
 from .._recording import Recording
@@ -105,12 +106,20 @@ def _alternative(problem: Problem, combination, unexplained: bool, probability: 
 
 
 def family_probability(problem: Problem, posterior: Posterior) -> dict[str, float]:
-    """Probability that an effect of each family is present."""
+    """Probability that an effect of each family is present; a force without a name is of any and of what it does."""
     total: dict[str, float] = {}
     for w in posterior.named:
-        for family in {problem.candidate(member).effect.family for member in w.combination}:
+        places = problem.placed(w.combination)
+        for family in {family for m, place in places for family in _families(problem.candidate(m), w.best.z[place])}:
             total[family] = min(1.0, total.get(family, 0.0) + w.probability)
     return dict(sorted(total.items(), key=lambda item: -item[1]))
+
+
+def _families(one: Candidate, sizes: Float[np.ndarray, " value"]) -> list[str]:
+    kind = one.nameless.kind if one.nameless else ""
+    if kind == "dissipation" and sizes[0] < 0:
+        kind = "activity"
+    return [one.effect.family, kind] if kind else [one.effect.family]
 
 
 def presence(problem: Problem, posterior: Posterior, told: Candidate) -> float:

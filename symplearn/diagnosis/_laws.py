@@ -16,6 +16,8 @@ from .._symbolic import derivative
 _FEW = 3
 # Share of the prior of what has no name that simple laws have; the rest is of what none of them tells.
 _SHARE = 0.5
+# Families that some are of.
+_LOSS, _STORE = "dissipation", "conservative"
 # Keeps the slope of a speed a number at rest.
 _TINY = sympy.Float(1e-300)
 
@@ -43,14 +45,14 @@ def priced(listed: Sequence[Nameless]) -> list[Nameless]:
 
 def _own(i: int, name: str, q: sympy.Expr, v: sympy.Expr) -> Iterator[Nameless]:
     """On one coordinate by itself."""
-    for words, term in (
-        ("goes with the third power of its speed", v**3),
-        (f"goes with its speed and the square of {name}", q**2 * v),
-        (f"goes with its speed and {name}", q * v),
-        (f"goes with {name} and the square of its speed, as where the inertia hangs on place", q * v**2),
-        (f"goes with the fifth power of {name}", q**5),
+    for kind, words, term in (
+        (_LOSS, "goes with the third power of its speed", -(v**3)),
+        (_LOSS, f"goes with its speed and the square of {name}", -(q**2) * v),
+        ("", f"goes with its speed and {name}", q * v),
+        ("", f"goes with {name} and the square of its speed, as where the inertia hangs on place", q * v**2),
+        (_STORE, f"goes with the fifth power of {name}", -(q**5)),
     ):
-        yield Nameless((i,), ((term,),), words=words)
+        yield Nameless((i,), ((term,),), words=words, kind=kind)
 
 
 def _between(
@@ -66,15 +68,17 @@ def _between(
         ((a - b) ** 4 / 4, f"({first} - {second})^4"),
     ):
         pushes = (-derivative(energy, a),), (-derivative(energy, b),)
-        yield Nameless(pair, pushes, words=f"comes from a potential energy that goes with {shown}")
+        yield Nameless(pair, pushes, words=f"comes from a potential energy that goes with {shown}", kind=_STORE)
     for place, name in ((a, first), (b, second)):
         pushes = (place * v[j],), (-place * v[i],)
-        yield Nameless(pair, pushes, words=f"acts across the motion, with its speed and {name}")
+        yield Nameless(pair, pushes, words=f"acts across the motion, with its speed and {name}", kind="gyroscopic")
     apart, speed = v[i] - v[j], sympy.sqrt(v[i] ** 2 + v[j] ** 2 + _TINY)
     drag = Absolute(apart) * apart
-    yield Nameless(pair, ((-drag,), (drag,)), words="acts between them with the square of their relative speed")
+    words = "acts between them with the square of their relative speed"
+    yield Nameless(pair, ((-drag,), (drag,)), words=words, kind=_LOSS)
     along = (-speed * v[i],), (-speed * v[j],)
-    yield Nameless(pair, along, words=f"acts along the motion in {first} and {second}, with the square of its speed")
+    words = f"acts along the motion in {first} and {second}, with the square of its speed"
+    yield Nameless(pair, along, words=words, kind=_LOSS)
     for k, m in ((i, j), (j, i)):
         yield Nameless((k,), ((q[m],),), words=f"goes with {names[m]}, which feels nothing of it")
         yield Nameless((k,), ((v[m],),), words=f"goes with the speed of {names[m]}, which feels nothing of it")
