@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import sympy
 
-from symplearn.diagnosis import Options, diagnose
+from symplearn.diagnosis import Options, _nameless, diagnose
 from symplearn.diagnosis._build import Restriction, augmented_equations, build
 from symplearn.diagnosis._laws import laws, priced
 from symplearn.diagnosis._prices import Prices
@@ -113,3 +113,21 @@ def test_laws_share_half_of_the_share_of_what_has_no_name():
     assert sum(np.exp(prices.log((m,))) for m in members) == pytest.approx(prices.remainder / 2)
     first = [m for m in members if problem.candidate(m).places == (0,)]
     assert not problem.is_possible(first[:2]) and problem.is_possible(first[:1])
+
+
+def test_where_there_is_no_law_and_no_expression_an_answer_is_given(monkeypatch):
+    """A pendulum that random blows drive is diagnosed to the end where no law is at hand and no expression is stable:
+    what is told has a name, or none."""
+    rng, times, state, shown = np.random.default_rng(5), np.linspace(0.0, 12.0, 121), [0.8, 0.0], []
+    for t, later in zip(times[:-1], times[1:], strict=True):
+        shown.append(state[0])
+        q, p = cases.solved(lambda t, x: [x[1], -np.sin(x[0])], state, np.array([t, later]), 1e-8)[-1]
+        state = [q, p + 0.15 * rng.normal()]
+    readings = np.array([*shown, state[0]]) + 0.02 * rng.normal(size=len(times))
+    asked = []
+    monkeypatch.setattr(_nameless, "laws", lambda file: [])
+    monkeypatch.setattr(_nameless, "proposals", lambda *given: asked.append(given) or [])
+    some = Restriction(("viscous_damping", "unnamed_force"))
+    found = diagnose(cases.simulation("p**2/2 - cos(q)"), [cases.recorded(times, readings)], Options(restriction=some))
+    assert asked and found.document["verdict"] in ("unexplained", "mismatch")
+    assert all(one["effect"] == "viscous_damping" for one in found.document["findings"])

@@ -72,6 +72,8 @@ class _Extended:
 
     def usable(self, forces: Sequence[Nameless], taken: Container[int]) -> list[Nameless]:
         """Those that are a number along the recorded motion, and somewhere not zero, on coordinates that are free."""
+        if not forces:
+            return []
         scales = zip(forces, self._scales(forces), strict=True)
         return [one for one, scale in scales if np.isfinite(scale).all() and not any(i in taken for i in one.places)]
 
