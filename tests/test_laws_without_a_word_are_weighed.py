@@ -85,12 +85,15 @@ def test_every_law_between_two_is_what_it_says():
         point = dict(zip(names, map(sympy.Float, rng.normal(size=4)), strict=True))
         number = {i: float(f.subs(point).doit()) for i, f in force.items()}
         speed = float(point[p1]) / 2, float(point[p2])
-        kind = next((k for k in ("potential", "across", "between", "along") if k in law.words), "own or one-sided")
+        known = {"turns": "circulatory"} | {word: word for word in ("potential", "across", "between", "along")}
+        kind = next((kind for word, kind in known.items() if word in law.words), "own or one-sided")
         kinds[kind] = kinds.get(kind, 0) + 1
         power = sum(number[i] * speed[i] for i in number)
         if kind == "potential":
             curl = sympy.diff(force[0], x2) - sympy.diff(force[1], x1)
             assert abs(float(curl.subs(point))) < 1e-12
+        elif kind == "circulatory":
+            assert number == {0: float(point[x2]), 1: -float(point[x1])}
         elif kind == "across":
             assert abs(power) < 1e-12
         elif kind in ("between", "along"):
@@ -98,7 +101,7 @@ def test_every_law_between_two_is_what_it_says():
             assert (abs(number[0] + number[1]) < 1e-12) == (kind == "between")
         else:
             assert len(law.places) == 1
-    assert kinds == {"potential": 4, "across": 2, "between": 1, "along": 1, "own or one-sided": 14}
+    assert kinds == {"potential": 4, "across": 2, "between": 1, "along": 1, "own or one-sided": 18, "circulatory": 1}
 
 
 def test_laws_share_half_of_the_share_of_what_has_no_name():

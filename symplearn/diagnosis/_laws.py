@@ -12,7 +12,7 @@ from .._kinks import Absolute
 from .._simulation_records import SimulationFile
 from .._symbolic import derivative
 
-# Coordinates up to which forces between two of them are tried: there are twelve for every two.
+# Coordinates up to which forces between some of them are tried: there are thirteen for every two.
 _FEW = 3
 # Share of the prior of what has no name that simple laws have; the rest is of what none of them tells.
 _SHARE = 0.5
@@ -35,6 +35,7 @@ def laws(file: SimulationFile) -> list[Nameless]:
     listed = [law for i in number for law in _own(i, file.coordinates[i], q[i], v[i])]
     if len(q) <= _FEW:
         listed += [law for pair in combinations(number, 2) for law in _between(pair, file.coordinates, q, v)]
+        listed += [_of_three(three, file.coordinates, q) for three in combinations(number, 3)]
     return listed
 
 
@@ -51,6 +52,8 @@ def _own(i: int, name: str, q: sympy.Expr, v: sympy.Expr) -> Iterator[Nameless]:
         ("", f"goes with its speed and {name}", q * v),
         ("", f"goes with {name} and the square of its speed, as where the inertia hangs on place", q * v**2),
         (_STORE, f"goes with the fifth power of {name}", -(q**5)),
+        (_LOSS, f"goes with its speed where {name} grows, and is not there on the way back", -(v + Absolute(v)) / 2),
+        (_LOSS, f"goes with its speed where {name} falls, and is not there on the way back", -(v - Absolute(v)) / 2),
     ):
         yield Nameless((i,), ((term,),), words=words, kind=kind)
 
@@ -72,6 +75,8 @@ def _between(
     for place, name in ((a, first), (b, second)):
         pushes = (place * v[j],), (-place * v[i],)
         yield Nameless(pair, pushes, words=f"acts across the motion, with its speed and {name}", kind="gyroscopic")
+    words = f"turns {first} towards {second} and {second} away from {first}, as where a shaft rubs in itself"
+    yield Nameless(pair, ((b,), (-a,)), words=words)
     apart, speed = v[i] - v[j], sympy.sqrt(v[i] ** 2 + v[j] ** 2 + _TINY)
     drag = Absolute(apart) * apart
     words = "acts between them with the square of their relative speed"
@@ -82,3 +87,11 @@ def _between(
     for k, m in ((i, j), (j, i)):
         yield Nameless((k,), ((q[m],),), words=f"goes with {names[m]}, which feels nothing of it")
         yield Nameless((k,), ((v[m],),), words=f"goes with the speed of {names[m]}, which feels nothing of it")
+
+
+def _of_three(three: tuple[int, int, int], names: tuple[str, ...], q: Sequence[sympy.Expr]) -> Nameless:
+    """Of the energy that three coordinates have together, as three waves do."""
+    energy = sympy.Mul(*(q[i] for i in three))
+    pushes = tuple((-derivative(energy, q[i]),) for i in three)
+    shown = " ".join(names[i] for i in three)
+    return Nameless(three, pushes, words=f"comes from a potential energy that goes with {shown}", kind=_STORE)
