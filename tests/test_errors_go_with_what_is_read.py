@@ -36,6 +36,28 @@ def test_polynomials_are_integrated_out(ratio):
     np.testing.assert_allclose(columns[:4] @ one.cleared(ratio).T, gram, rtol=1e-9)
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e-20])
+def test_how_large_it_is_is_judged_beside_what_the_unknowns_make_up_for(unit):
+    """What is left of the error is that of least squares by unknowns of given precisions, in whatever unit those are;
+    one that is known makes up for nothing."""
+    rng = np.random.default_rng(3)
+    slopes, error, shapes = rng.normal(size=(2, 50)), rng.normal(size=50), rng.normal(size=(3, 50))
+    slopes[0] *= unit
+    one = _Channel(np.concatenate([error[None], slopes, shapes]), 3, np.ones(50, bool), 0.0, 50.0)
+    for known, some in ((False, slopes), (True, slopes[:1])):
+        found, log = one.left(np.array([4.0 * unit**2, np.inf if known else 2.0]))(5.0)
+        width = np.array([0.5 / unit, np.sqrt(0.5)])[: len(some)]
+        # A dense Gaussian process: white noise and the shapes, beside the slopes.
+        inside, process = np.eye(50) + 5.0 / 3 * shapes.T @ shapes, (some.T * width**2) @ some
+        expected = error @ np.linalg.inv(np.eye(50) + process) @ error
+        plain = np.linalg.inv(np.eye(50) + process)
+        least = (
+            plain - plain @ shapes.T @ np.linalg.inv(3 / 5.0 * np.eye(3) + shapes @ plain @ shapes.T) @ shapes @ plain
+        )
+        assert found == pytest.approx(error @ least @ error) and found < expected
+        assert log == pytest.approx(np.linalg.slogdet(plain @ (inside + process))[1])
+
+
 @pytest.mark.parametrize("ratio", [0.05, 30.0])
 def test_the_error_is_what_a_dense_process_expects(ratio):
     """Its mean, and the rms of what is left of its sd, are those of Gaussian process regression on the same errors."""

@@ -63,11 +63,11 @@ class _Channel:
         free = 1 + np.flatnonzero(np.isfinite(precision))
         rest = np.concatenate([[0], np.arange(self.plain, len(self.columns))])
         held = self.gram[np.ix_(free, free)] + np.diag(precision[free - 1])
-        # An unknown that does nothing, of no precision, makes up for nothing.
-        held += np.diag(np.where(np.diagonal(held) > 0, 0.0, 1.0))
-        gram, cross = self.gram[np.ix_(rest, rest)], self.gram[np.ix_(free, rest)]
+        # In the unknowns' own units; one that does nothing, of no precision, makes up for nothing.
+        size = np.sqrt(np.where(np.diagonal(held) > 0, np.diagonal(held), 1.0))
+        gram, cross = self.gram[np.ix_(rest, rest)], self.gram[np.ix_(free, rest)] / size[:, None]
         if np.isfinite(self.gram).all():  # of a trajectory that has not run away
-            gram = gram - cross.T @ np.linalg.lstsq(held, cross)[0]
+            gram = gram - cross.T @ np.linalg.lstsq(held / np.outer(size, size), cross)[0]
 
         def value(ratio: float) -> tuple[float, float]:
             found, log = self._marginal(gram, 1, ratio)
