@@ -27,7 +27,8 @@ def laws(file: SimulationFile) -> list[Nameless]:
 
     Powers of place and speed that the vocabulary does not have, damping that hangs on place, inertia that does;
     energies and gyroscopic forces of two coordinates, what one of them does to the other and not back, and what goes
-    with the speed of both.
+    with the speed of both. What a swing hardly tells from a word is not among them: two dampings one way only took the
+    probability of a viscous one, a force that grows with time that of a sensor's drift.
     """
     states, number = file.symbols, range(len(file.coordinates))
     q = [states[name] for name in file.coordinates]
@@ -52,8 +53,6 @@ def _own(i: int, name: str, q: sympy.Expr, v: sympy.Expr) -> Iterator[Nameless]:
         ("", f"goes with its speed and {name}", q * v),
         ("", f"goes with {name} and the square of its speed, as where the inertia hangs on place", q * v**2),
         (_STORE, f"goes with the fifth power of {name}", -(q**5)),
-        (_LOSS, f"goes with its speed where {name} grows, and is not there on the way back", -(v + Absolute(v)) / 2),
-        (_LOSS, f"goes with its speed where {name} falls, and is not there on the way back", -(v - Absolute(v)) / 2),
     ):
         yield Nameless((i,), ((term,),), words=words, kind=kind)
 
