@@ -93,6 +93,19 @@ def test_the_trajectory_runs_on_whatever_the_sensor_remembers(clear):
     assert replace(lost, estimates={drag: away}).shown(drag, coloured).kind == "coloured"
 
 
+def test_it_runs_on_beside_a_clock_whether_or_not_that_fit_is_done(clear):
+    """Where the clock is told and a remembering sensor stands next, the whole trajectory runs on, though that one's fit
+    is not done and an error that goes with what is read, far behind, has one that is."""
+    found, (*_, drag) = clear
+    coloured, white = (found.of(drag, kind) for kind in ("coloured", "white"))
+    clock = replace(coloured, kind="clock", log_evidence=coloured.log_evidence + 200.0)
+    behind = replace(white, kind="positional", log_evidence=white.log_evidence + 1.0)
+    ones = [clock, replace(coloured, converged=False), behind, white]
+    lost = replace(found, ahead={drag: replace(found.ahead[drag], holds=False)}, estimates={drag: ones})
+    assert coloured.log_evidence > behind.log_evidence + 5.0
+    assert lost.told(drag, clock) is clock and lost.shown(drag, clock).kind == "white"
+
+
 def test_white_noise_needs_no_second_look():
     """Where the best answer leaves nothing but noise, evidence alone counts, and the best estimate is shown."""
     found, (*_, drag) = found_in(0.0)

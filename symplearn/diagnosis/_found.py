@@ -153,9 +153,12 @@ class Found:
         that did not converge says nothing, however large. Where the remainder is clear, an error of the sensor that
         remembers itself is as much of a guess, and the fit that has made the run itself as near as can be runs on."""
         told = self.told(combination, best)
-        others = [one for one in self.estimates[combination] if one.kind != told.kind and one.converged]
-        run_on = speaker(others) if told.kind == "clock" and others else told
-        if run_on.kind == "coloured" and combination in self.ahead:
+        others = [one for one in self.estimates[combination] if one.kind != told.kind]
+        done = [one for one in others if one.converged]
+        run_on = speaker(done) if told.kind == "clock" and done else told
+        # Whether a fit beside coloured errors is done does not matter where its place is another's.
+        first = speaker(others) if told.kind == "clock" and others else told
+        if "coloured" in (run_on.kind, first.kind) and combination in self.ahead:
             run_on = self._trajectory_fit(combination, run_on)
         return within_bounds(self.problem, self.priors, run_on)
 
