@@ -41,7 +41,7 @@ def test_a_force_takes_the_place():
     assert start.combination == force and not start.z[p.unseen(0)].any()
     w.weigh([start], whole=True)
     one = w.found.of(force, "white")
-    # Ten standard errors of a frequency, sqrt(24 / 300) noises over amplitude and time: 0.01, 0.106 and 60.
+    # Eleven standard errors of a frequency, sqrt(24 / 300) noises over amplitude and time: 0.01, 0.106 and 60.
     assert one.converged and one.z[p.slots + 2] == pytest.approx(OMEGA, abs=0.005)
     assert one.log_evidence > w.found.of(hidden, "white").log_evidence
     assert as_driven(w, force) == []

@@ -148,7 +148,7 @@ class Answer:
         places = self.problem.placed(self.after.combination)
         ones = [(m, self.problem.candidate(m).told(), self.after.z[place]) for m, place in places]
         return {m: {one: written(one.nameless.pushes[0], sizes) for one in told if one.nameless}
-                for m, told, sizes in ones}  # fmt: skip
+                for m, told, sizes in ones if told[0].nameless}  # fmt: skip
 
     def _spread(self) -> float:
         return 1.0 / self.posterior.tempered

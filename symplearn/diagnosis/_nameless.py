@@ -49,7 +49,7 @@ def weigh_nameless(file: SimulationFile, recordings: Sequence[Recording], option
     begun = _Extended(file, recordings, options, search)
     if known := priced(begun.usable(laws(file), taken)):
         begun.extend(known)
-        _weigh_laws(search, [m for m, _ in begun.members(known)])
+        _weigh_laws(search, begun.members(len(known)))
     pull = search.found.of(search.base, "force")
     if pull is None or pull.intensity is None or not search.in_time() or not _is_open(_odds(search), search.found):
         return
@@ -88,10 +88,10 @@ class _Extended:
         scales = [float(x) for each in self._scales(forces) for x in each]
         search.goes_on(Stepper(problem, self.options.jobs), with_nameless(problem, search.found.priors, scales))
 
-    def members(self, forces: Sequence[Nameless]) -> list[tuple[int, Nameless]]:
-        """The last forces that the search was extended by, with their members."""
-        number = len(self.search.problem.equations.candidates)
-        return list(zip(range(number - len(forces), number), forces, strict=True))
+    def members(self, number: int) -> range:
+        """Of the last so many forces that the search was extended by."""
+        every = len(self.search.problem.equations.candidates)
+        return range(every - number, every)
 
     def _scales(self, forces: Sequence[Nameless]) -> list[Float[np.ndarray, " amplitude"]]:
         """Prior scales of their amplitudes: as strong as every other effect where it is strongest."""
@@ -192,9 +192,9 @@ def _weigh_beside_remainders(search: Search, members: Sequence[int]) -> None:
 
 def _weigh_proposals(search: Search, begun: _Extended, listed: Sequence[Proposal]) -> None:
     """All expressions together, alone and beside a missing force."""
-    members = begun.members([one.force for one in listed])
-    combination, z = tuple(sorted((*search.base, *(m for m, _ in members)))), search.from_seed()
-    sizes = {m: one.sizes for (m, _), one in zip(members, listed, strict=True)}
+    members = begun.members(len(listed))
+    combination, z = tuple(sorted((*search.base, *members))), search.from_seed()
+    sizes = {m: one.sizes for m, one in zip(members, listed, strict=True)}
     for member, place in search.problem.placed(combination):
         if member in sizes:
             z[place] = sizes[member]
