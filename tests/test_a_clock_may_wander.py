@@ -8,7 +8,8 @@ import pytest
 from test_coloured_errors_are_whitened import autocovariance, irregular_times
 
 from symplearn.diagnosis._calibrate import calibrate
-from symplearn.diagnosis._clock import _gram_of, _Piece, weigh_clock
+from symplearn.diagnosis._clock import weigh_clock
+from symplearn.diagnosis._clock_errors import Piece, cleared
 from symplearn.diagnosis._coloured import Colour
 from symplearn.diagnosis._found import Found
 from symplearn.diagnosis._start import priors_without_effects
@@ -32,14 +33,13 @@ def test_sensor_and_clock_are_integrated_out_together():
     weight, rates = rng.uniform(0.5, 20.0, len(times)), rng.normal(size=len(times))
     weight[::4] = 0.0
     columns = rng.normal(size=(1 + len(p.local(0)), len(times)))
-    gram, log = _gram_of(p, [_Piece(columns, rates, weight, times)], BOTH)
+    series, log = cleared(Piece(columns, rates, weight, times), BOTH)
     seen, lags = weight > 0, times[:, None] - times
     sensor, clock = (one.ratio * autocovariance(lags, one.frequency, one.damping) for one in BOTH)
     S = (sensor + np.outer(rates, rates) * clock)[np.ix_(seen, seen)] + np.diag(1 / weight[seen])
     expected = columns[:, seen] @ np.linalg.solve(S, columns[:, seen].T)
-    place = np.concatenate([[0], 1 + p.local(0)])
     # Covariances of condition up to 1e5 cost the dense solution five of sixteen digits, here and in the determinant.
-    np.testing.assert_allclose(gram[np.ix_(place, place)], expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
+    np.testing.assert_allclose(series.T @ series, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
     assert log == pytest.approx(np.linalg.slogdet(S)[1], rel=1e-8)
 
 
@@ -101,3 +101,19 @@ def test_a_clock_that_keeps_time_explains_nothing():
     """No evidence is gained where rows are read when they say."""
     found, (drag, _) = weighed(np.zeros(len(TIMES)))
     assert found.of(drag, "clock").log_evidence < found.of(drag, "white").log_evidence + 1.0
+
+
+def test_a_camera_reads_its_rows_one_after_the_other_besides():
+    """Where a reading is the later the farther out it is, on top of a wandering clock, that error is found for what it
+    is, and the true law stays far ahead; the clock alone would leave it."""
+    q = swing(np.zeros(len(TIMES)))
+    later = 0.05 * q
+    found, laws = weighed(late(0) + later)
+    (drag, viscous), (coloured, _) = ([found.of(law, kind) for law in laws] for kind in ("clock", "coloured"))
+    assert drag.log_evidence > viscous.log_evidence + 10
+    assert drag.log_evidence > coloured.log_evidence + 20
+    shift, speeds = drag.bends[0](q, TIMES), np.gradient(q, TIMES)
+    # To first order it is the lateness times the speed; the clock, which is as free, takes a part (seen: 0.35 is left).
+    expected = later * speeds
+    assert np.sqrt(np.mean((shift - expected) ** 2)) < 0.5 * np.sqrt(np.mean(expected**2))
+    assert drag.reading_noise[0] > 3 * drag.noise[0]

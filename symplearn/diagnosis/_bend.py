@@ -35,7 +35,10 @@ class Shapes:
         self, expected: Float[np.ndarray, "*batch row"], times: Float[np.ndarray, " row"]
     ) -> Float[np.ndarray, "*batch row shape"]:
         if self.curve:
-            return curves(expected, *self.readings)
+            plain = curves(expected, *self.readings)
+            if self.speeds is None:
+                return plain
+            return np.concatenate([plain, _joint(expected, times, self.readings, self.speeds)], axis=-1)
         shapes = polynomials(expected, *self.readings)
         if self.speeds is None:
             return shapes
@@ -71,6 +74,16 @@ def curves(expected: Float[np.ndarray, "*row"], low: float, high: float) -> Floa
     """The square and the cube, counted from the middle of a range, of mean square one over it."""
     place = _place(expected, low, high)
     return np.stack([place**k * np.sqrt(2 * k + 1) for k in _CURVE], axis=-1)
+
+
+def _joint(
+    expected: Float[np.ndarray, "*batch row"], times: Float[np.ndarray, " row"], readings: tuple[float, float],
+    speeds: tuple[float, float],
+) -> Float[np.ndarray, "*batch row 2"]:  # fmt: skip
+    """The product of place and speed, counted from the middles of their ranges, and the square of the speed; of mean
+    square one over these."""
+    place, speed = _place(expected, *readings), _place(rate(expected, times), *speeds)
+    return np.stack([3.0 * place * speed, np.sqrt(5.0) * speed**2], axis=-1)
 
 
 def polynomials(expected: Float[np.ndarray, "*row"], low: float, high: float) -> Float[np.ndarray, "*row degree"]:

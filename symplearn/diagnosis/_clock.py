@@ -2,76 +2,91 @@
 
 Such an error goes with the rate of change of what is read, and vanishes where that turns. There the amplitudes stand as
 they are, so that laws which differ in how a motion decays are told apart however far its phase wanders.
+
+What a camera sees has other errors at the same time: its view is askew, and its rows are read one after the other. So a
+plain curve of place and speed may stand beside both.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.special import logsumexp
 
+from ._bend import Bend, Shapes
 from ._calibrate import Fits, Priors, residuals, weights
-from ._coloured import (
-    MOST_ROWS,
-    RATIOS,
-    Colour,
-    chosen,
-    filled,
-    grid_of,
-    row_gaps,
-    row_variances,
-    whitened,
-)
+from ._clock_errors import Piece, cleared, fitted, pieces_of
+from ._coloured import Colour
 from ._evidence import variance_inflation
 from ._problem import Problem
-from ._scatter import law_gain, tail_gain
-from ._weighed import REMAINDER, Estimate, correlated, trusting
+from ._scatter import law_gain
+from ._weighed import Estimate, amplitudes_out, correlated, trusting
 
-# How often sensor and clock are fitted, in turn, each with the other as it is; and how often all of that, about the
-# path that follows.
-_TURNS, _PASSES = 3, 2
-# Dampings of the clock's error, and how many memory lengths are tried.
-_DAMPINGS, _TIMES = (30.0, 1.001), 5
-# Steps of the logarithms of (ratio, frequency, damping) of both about the best, as many as the grid has points; and how
-# large they are, in turn.
-_NEARBY = np.random.default_rng(0).normal(size=(len(_DAMPINGS) * _TIMES * len(RATIOS), 2, 3)) * [1.0, 1.0, 0.0]
-_FINER = (1.0, 0.5, 0.25)
+# How often errors of sensor and clock are fitted, about the path that follows.
+_PASSES = 2
+# Sizes of a curve that are tried, against the white noise.
+_CURVES = (1.0, 4.0, 16.0)
 
-_whitened = jax.jit(whitened)
-_on_grid = jax.jit(jax.vmap(whitened, (None, None, None, None, 0)))
+Both = list[tuple[Colour, Colour]]
 
 
 @dataclass(frozen=True, eq=False)
-class _Piece:
-    """One channel in one recording: columns [error, slopes], and the factors of both errors, all by row."""
+class _Lane:
+    """One combination's fit: its pieces by channel and recording, whose last columns are a curve's shapes, if any."""
 
-    columns: Float[np.ndarray, "column row"]
-    rates: Float[np.ndarray, " row"]
-    weight: Float[np.ndarray, " row"]
-    times: Float[np.ndarray, " row"]
+    problem: Problem
+    fits: Fits
+    priors: Priors
+    b: int
+    pieces: list[list[Piece]]
+    number: np.ndarray  # readings by channel
+    shapes: tuple[Shapes, ...] = ()  # by channel
 
-    def middle(self, column: Float[np.ndarray, " column"]) -> "_Piece":
-        """The rows that shapes are searched with, and their errors, a sum of the columns."""
-        begin = max(0, (len(self.times) - MOST_ROWS) // 2)
-        some = slice(begin, begin + MOST_ROWS)
-        return _Piece((column @ self.columns)[None, some], self.rates[some], self.weight[some], self.times[some])
+    @property
+    def curves(self) -> int:
+        """How many shapes a channel's curve has."""
+        return self.pieces[0][0].columns.shape[0] - 1 - self.problem.local(0).size
 
-    @cached_property
-    def rows(self) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Factors, variances and gaps, as the filter takes them."""
-        loadings = np.stack([np.ones_like(self.rates), self.rates])
-        return filled(loadings), row_variances(self.weight), row_gaps(self.times)
+    def left(
+        self, z: Float[np.ndarray, " z"], amplitudes: Float[np.ndarray, "channel curve"], j: int
+    ) -> list[Float[np.ndarray, " column"]]:
+        """What unknowns and curves leave of one channel's errors, as sums of its columns, by recording."""
+        off = self.fits.z[self.b] - z
+        return [np.concatenate([[1.0], off[self.problem.local(k)], -amplitudes[j]])
+                for k in range(len(self.pieces[j]))]  # fmt: skip
+
+    def bent(self) -> "_Lane":
+        """The same with a plain curve of place and speed among the columns of every channel."""
+        expected, shapes, pieces = self.fits.predictions, [], []
+        for j, own in enumerate(self.pieces):
+            shown, times = [p.readings[self.b, :, j] for p in expected], [one.times for one in own]
+            seen = np.concatenate([one.weight > 0 for one in own])
+            shape = Shapes.over(shown, times, seen, moving=True, curve=True)
+            curves = [np.where(one.weight > 0, shape(x, one.times).T, 0.0) for one, x in zip(own, shown, strict=True)]
+            pieces.append([replace(one, columns=np.concatenate([one.columns, curve]))
+                           for one, curve in zip(own, curves, strict=True)])  # fmt: skip
+            shapes.append(shape)
+        return replace(self, pieces=pieces, shapes=tuple(shapes))
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What is known of a lane beside errors of sensors and clocks: the estimate, and its curves' amplitudes with what
+    is not known of them."""
+
+    estimate: Estimate
+    both: Both
+    amplitudes: Float[np.ndarray, "channel curve"]
+    spread: Float[np.ndarray, "channel curve curve"]
 
 
 @np.errstate(all="ignore")  # a lane that diverged is told by its evidence
 def weigh_clock(
     problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int], colours: Sequence[Sequence[Colour]]
 ) -> list[Estimate]:
-    """Estimates where every channel's error has a memory and its clock runs ahead and behind, about the trajectory fit.
+    """Estimates where every channel's error has a memory and its clock runs ahead and behind, about the trajectory fit;
+    alone, and beside a plain curve of place and speed, each as likely as the other.
 
     `colours` are those of the sensors alone, by lane and channel. None for a combination with a wrongly given noise.
     """
@@ -80,140 +95,114 @@ def weigh_clock(
     number = sum((w > 0).sum(0) for w in weight)
     out: list[Estimate] = []
     for b in trusting(problem, fits):
-        pieces = [_pieces(problem, fits, [x[b, :, j] for x in errors], weight, b, j) for j in range(problem.channels)]
-        both, z = [(colour, replace(colour, ratio=0.0)) for colour in colours[b]], fits.z[b]
-        begins = [both]
+        pieces = [pieces_of(problem, fits, [x[b, :, j] for x in errors], weight, b, j) for j in range(problem.channels)]
+        lane = _Lane(problem, fits, priors, b, pieces, number)
+        begins: list[Both] = [[(colour, replace(colour, ratio=0.0)) for colour in colours[b]]]
         if out:  # the errors beside another law, too: each search may be caught in an optimum of its own
             best = max(out, key=lambda one: one.log_evidence)
             begins.append(list(zip(best.colours, best.clocks, strict=True)))
-        for _ in range(_PASSES):  # what is off the path changes what the path is
-            off = fits.z[b] - z
-            both = [_fitted(problem, pieces[j], j, [one[j] for one in begins], off) for j in range(problem.channels)]
-            begins = [both]
-            grams, logs = zip(*(_gram_of(problem, *one) for one in zip(pieces, both, strict=True)), strict=True)
-            occam = sum(colour.occam + clock.occam for colour, clock in both)
-            one = correlated(problem, fits, b, np.stack(grams), np.array(logs), number, occam, priors)
-            z = one.z
-        out.append(_told(problem, one, fits.z[b], pieces, both))
+        straight = _straight(lane, begins)
+        out.append(_mixed([_told(lane, straight)], _curved(lane.bent(), straight)))
     return out
 
 
-def _pieces(
-    problem: Problem, fits: Fits, errors: Sequence[np.ndarray], weight: Sequence[np.ndarray], b: int, j: int
-) -> list[_Piece]:
-    times = [r.times[: len(w)] for r, w in zip(problem.rows, weight, strict=True)]
-    speeds = rates([p.readings[b, :, j] for p in fits.predictions], times)
-    out = []
-    for k, x in enumerate(errors):
-        w = weight[k][:, j]
-        slopes = np.where(w > 0, fits.predictions[k].slopes[b, :, :, j], 0.0)
-        columns = np.concatenate([x[None], slopes])
-        out.append(_Piece(columns, speeds[k], w, times[k]))
-    return out
+def _straight(lane: _Lane, begins: list[Both]) -> _Known:
+    """Beside errors of sensor and clock alone."""
+    z, nothing = lane.fits.z[lane.b], np.zeros((lane.problem.channels, 0))
+    for _ in range(_PASSES):  # what is off the path changes what the path is
+        known = _integrated(lane, _refitted(lane, z, nothing, begins), np.ones(len(nothing)))
+        z, begins = known.estimate.z, [known.both]
+    return known
 
 
-def rates(shown: Sequence[np.ndarray], times: Sequence[np.ndarray]) -> list[Float[np.ndarray, " _"]]:
-    """How fast expected readings change, by recording, of a root mean square of one."""
-    found = [np.gradient(y, t) if len(t) > 1 else np.ones(len(t)) for y, t in zip(shown, times, strict=True)]
-    size = float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
-    return [np.nan_to_num(rate / (size or 1.0)) for rate in found]
+def _curved(lane: _Lane, straight: _Known) -> list[Estimate]:
+    """Beside a curve of each size, too; of the likeliest size the errors of sensor and clock are fitted again."""
+    noise = straight.estimate.noise
+    tried = [_integrated(lane, straight.both, size * noise) for size in _CURVES]
+    best = int(np.argmax(np.nan_to_num([one.estimate.log_evidence for one in tried], nan=-np.inf)))
+    one = tried[best]
+    both = _refitted(lane, one.estimate.z, one.amplitudes, [one.both])
+    again = _integrated(lane, both, _CURVES[best] * noise)
+    if again.estimate.log_evidence > one.estimate.log_evidence:
+        tried[best] = again
+    return [_told(lane, one) for one in tried]
 
 
-def whitened_beside(
-    columns: Sequence[Float[np.ndarray, "column _"]], shown: Sequence[Float[np.ndarray, " _"]],
-    weight: Sequence[Float[np.ndarray, " _"]], times: Sequence[Float[np.ndarray, " _"]],
-    both: tuple[Colour, Colour],
-) -> list[Float[np.ndarray, "column _"]]:  # fmt: skip
-    """One channel's columns, by recording, whitened beside errors of its sensor and of its clock; `shown` are the
-    expected readings."""
-    pieces = [_Piece(x, rate, w, t) for x, rate, w, t in zip(columns, rates(shown, times), weight, times, strict=True)]
-    return [_cleared(one, both)[0].T for one in pieces]
+def _mixed(*ways: list[Estimate]) -> Estimate:
+    """The likeliest of several ways, each of the same weight in all, with the evidence of all of them."""
+    listed = [one for way in ways for one in way]
+    share = np.concatenate([np.full(len(way), 1.0 / (len(ways) * len(way))) for way in ways])
+    values = np.nan_to_num([one.log_evidence for one in listed], nan=-np.inf)
+    best = listed[int((values + np.log(share)).argmax())]
+    return replace(best, log_evidence=float(logsumexp(values, b=share)))
 
 
-def _fitted(
-    problem: Problem, pieces: Sequence[_Piece], j: int, begins: Sequence[tuple[Colour, Colour]],
-    off: Float[np.ndarray, " z"],
-) -> tuple[Colour, Colour]:  # fmt: skip
-    """The likeliest error of the sensor and of its clock, each found in turn from the better one of some beginnings,
-    then together; sizes are against the white noise, and all unknowns `off` what the columns were taken at."""
-    known = problem.noise[j]
-    some = [one.middle(np.append(1.0, off[problem.local(k)])) for k, one in enumerate(pieces)]
-    grid = grid_of([one.times for one in pieces], _DAMPINGS, _TIMES)
-    largest = REMAINDER * float(np.nanstd(np.concatenate([r.readings[:, j] for r in problem.rows])))
-    both = list(begins[0])
-    if len(begins) > 1:  # filled up to the grid's number of points, whose program is compiled already
-        shapes = np.resize([[_shape(one) for one in pair] for pair in begins], (len(grid) + 1, 2, 3))
-        both = list(begins[int(np.argmax(_values(some, shapes, known, largest)[: len(begins)]))])
-    for turn in range(_TURNS):
-        searched = 1 - turn % 2
-        tried = np.append(grid, [_shape(both[searched])], axis=0)
-        shapes = np.repeat([[_shape(one) for one in both]], len(tried), axis=0)
-        shapes[:, searched] = tried
-        both[searched] = chosen(tried, _values(some, shapes, known, largest))
-    best = np.array([_shape(one) for one in both])
-    for steps in _NEARBY * np.array(_FINER)[:, None, None, None]:
-        shapes = np.append(best[None], best * np.exp(steps), axis=0)
-        best = shapes[int(np.argmax(_values(some, shapes, known, largest)))]
-    names = ("ratio", "frequency", "damping")
-    sensor, clock = (replace(one, **dict(zip(names, map(float, shape), strict=True)))
-                     for one, shape in zip(both, best, strict=True))  # fmt: skip
-    return sensor, clock
+def _refitted(
+    lane: _Lane, z: Float[np.ndarray, " z"], amplitudes: Float[np.ndarray, "channel curve"], begins: list[Both]
+) -> Both:
+    """Errors of every channel's sensor and clock, in what these unknowns and curves leave."""
+    return [fitted(lane.problem, own, j, [one[j] for one in begins], lane.left(z, amplitudes, j))
+            for j, own in enumerate(lane.pieces)]  # fmt: skip
 
 
-def _values(pieces: Sequence[_Piece], shapes: Float[np.ndarray, "point both shape"], known: float, largest: float):
-    """Log likelihoods of several shapes of both errors, whose innovations may have heavy tails: clocks leap."""
-    places, logs, parts = tuple(jnp.asarray(part) for part in np.moveaxis(shapes, 2, 0)), np.zeros(len(shapes)), []
-    for one in pieces:
-        found, log = _on_grid(filled(one.columns), *one.rows, places)
-        parts.append(np.asarray(found)[:, : len(one.times), 0][:, one.weight > 0])
-        logs += np.asarray(log)
-    e = np.concatenate(parts, axis=1)
-    white = np.maximum(np.mean(e**2, axis=1), 1e-300) if np.isnan(known) else np.full(len(shapes), known**2)
-    e = e / np.sqrt(white)[:, None]
-    value = -0.5 * (e.shape[1] * np.log(white) + (e**2).sum(1) + logs) + tail_gain(e, bool(np.isnan(known)))
-    return np.where(np.isfinite(value) & (shapes[:, :, 0].max(1) * white <= largest**2), value, -np.inf)
+def _integrated(lane: _Lane, both: Both, size: Float[np.ndarray, " channel"]) -> _Known:
+    """Unknowns and curves, whose shapes have together this root mean square, integrated beside given errors."""
+    problem, fits, b = lane.problem, lane.fits, lane.b
+    unit = size / np.sqrt(max(lane.curves, 1))
+    grams, logs = zip(*(_gram(lane, j, both[j], unit[j]) for j in range(problem.channels)), strict=True)
+    occam = sum(colour.occam + clock.occam for colour, clock in both)
+    one = correlated(problem, fits, b, np.stack(grams), np.array(logs), lane.number, occam, lane.priors)
+    total = (np.stack(grams) / (one.noise**2)[:, None, None]).sum(0)
+    follow = amplitudes_out(total, 1 + problem.size)[1]
+    column = np.concatenate([[1.0], fits.z[b] - one.z])
+    amplitudes = (follow @ column).reshape(problem.channels, -1) * unit[:, None]
+    rest = total[1 + problem.size :, 1 + problem.size :]
+    own = np.arange(len(rest)).reshape(problem.channels, -1)
+    spread = np.stack(
+        [np.linalg.inv(rest[np.ix_(k, k)] + np.eye(len(k))) * u**2 for k, u in zip(own, unit, strict=True)]
+    )
+    return _Known(one, both, amplitudes, spread)
 
 
-def _shape(one: Colour) -> tuple[float, float, float]:
-    return one.ratio, one.frequency, one.damping
-
-
-def _shapes(both: Sequence[Colour]) -> Any:
-    """Ratios, frequencies and dampings of sensor and clock."""
-    return tuple(jnp.asarray(part) for part in zip(*map(_shape, both), strict=True))
-
-
-def _gram_of(problem: Problem, pieces: Sequence[_Piece], both: Sequence[Colour]) -> tuple[np.ndarray, float]:
-    """Gram matrix of one channel's whitened columns, all recordings together, and the log determinants."""
-    full, total = np.zeros((1 + problem.size, 1 + problem.size)), 0.0
-    for k, one in enumerate(pieces):
-        place = np.concatenate([[0], 1 + problem.local(k)])
-        series, log = _cleared(one, both)
+def _gram(lane: _Lane, j: int, both: tuple[Colour, Colour], unit: float) -> tuple[np.ndarray, float]:
+    """Gram matrix of one channel's whitened columns, all recordings together, those of all channels' curves behind the
+    unknowns; and the log determinants."""
+    size, curves = 1 + lane.problem.size, lane.curves
+    full, total = np.zeros((size + curves * lane.problem.channels,) * 2), 0.0
+    for k, one in enumerate(lane.pieces[j]):
+        place = np.concatenate([[0], 1 + lane.problem.local(k), size + j * curves + np.arange(curves)])
+        series, log = cleared(one, both)
+        series = series * np.where(place < size, 1.0, unit)
         full[np.ix_(place, place)] += series.T @ series
         total += log
     return full, total
 
 
-def _told(
-    problem: Problem, one: Estimate, begin: np.ndarray, pieces: Sequence[Sequence[_Piece]],
-    both: Sequence[tuple[Colour, Colour]],
-) -> Estimate:  # fmt: skip
-    """With what heavier tails gain, and how far from white the scores are that are left."""
-    errors, scores = [], []
-    for k in range(len(problem.rows)):
-        column = np.concatenate([[1.0], (begin - one.z)[problem.local(k)]])
-        series = [_cleared(piece[k], shape)[0] / noise
-                  for piece, shape, noise in zip(pieces, both, one.noise, strict=True)]  # fmt: skip
-        left = [np.where(piece[k].weight > 0, x @ column, np.nan) for piece, x in zip(pieces, series, strict=True)]
-        errors.append(np.stack(left, axis=1))
-        scores.append(sum((x @ column)[:, None] * x[:, 1 + problem.state :] for x in series))
-    value = one.log_evidence + law_gain(problem, one.combination, np.concatenate(errors))
-    colours, clocks = zip(*both, strict=True)
+def _told(lane: _Lane, known: _Known) -> Estimate:
+    """With what heavier tails gain, how far from white the scores are that are left, and the curves."""
+    one, errors, scores = known.estimate, [], []
+    left = [lane.left(one.z, known.amplitudes, j) for j in range(lane.problem.channels)]
+    for k in range(len(lane.problem.rows)):
+        slopes = slice(1 + lane.problem.state, 1 + lane.problem.local(k).size)
+        series = [cleared(piece[k], shape)[0] / noise
+                  for piece, shape, noise in zip(lane.pieces, known.both, one.noise, strict=True)]  # fmt: skip
+        each = [np.where(piece[k].weight > 0, x @ column[k], np.nan)
+                for piece, x, column in zip(lane.pieces, series, left, strict=True)]  # fmt: skip
+        errors.append(np.stack(each, axis=1))
+        scores.append(sum((x @ column[k])[:, None] * x[:, slopes] for x, column in zip(series, left, strict=True)))
+    value = one.log_evidence + law_gain(lane.problem, one.combination, np.concatenate(errors))
+    colours, clocks = zip(*known.both, strict=True)
     inflation = variance_inflation(np.concatenate(scores))
-    return replace(one, kind="clock", log_evidence=value, colours=colours, clocks=clocks, inflation=inflation)
+    one = replace(one, kind="clock", log_evidence=value, colours=colours, clocks=clocks, inflation=inflation)
+    return one if not lane.shapes else _with_curves(lane, known, one)
 
 
-def _cleared(one: _Piece, both: Sequence[Colour]) -> tuple[Float[np.ndarray, "row column"], float]:
-    """Whitened columns in units of the white sd, and the log determinant that the whitening leaves."""
-    series, log = _whitened(filled(one.columns), *one.rows, _shapes(both))
-    return np.asarray(series)[: len(one.times)], float(log)
+def _with_curves(lane: _Lane, known: _Known, one: Estimate) -> Estimate:
+    """With the curve of every channel, and its variance against the noise's."""
+    bends, sizes = [], []
+    for shapes, own, mean, spread in zip(lane.shapes, lane.pieces, known.amplitudes, known.spread, strict=True):
+        every = np.concatenate([piece.columns[-lane.curves :].T[piece.weight > 0] for piece in own])
+        unsure = np.einsum("ra,ab,rb->r", every, spread, every).mean()
+        bends.append(Bend(shapes, mean, float(np.sqrt(unsure))))
+        sizes.append(float(((every @ mean) ** 2).mean()))
+    return replace(one, bends=tuple(bends), bent=tuple(np.array(sizes) / one.noise**2))

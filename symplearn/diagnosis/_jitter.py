@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from ._bearers import Left, Sizes, borne, largest, log_likelihood, sizes
 from ._calibrate import Fits, Priors, residuals, weights
-from ._clock import rates
+from ._clock_errors import rates
 from ._evidence import variance_inflation
 from ._problem import Problem
 from ._scatter import law_gain

@@ -102,8 +102,7 @@ def weigh_positional(
     """
     out = []
     for b in range(len(fits.combinations)):
-        curves = (False,) if moving else (True, False)
-        ways = [_weighed(problem, fits, b, priors, rows, moving, curve) for curve in curves]
+        ways = [_weighed(problem, fits, b, priors, rows, moving, curve) for curve in (True, False)]
         values = np.nan_to_num([one.log_evidence for one in ways], nan=-np.inf)
         value = float(np.logaddexp.reduce(values)) - float(np.log(len(ways)))
         out.append(replace(ways[int(values.argmax())], log_evidence=value))
@@ -155,15 +154,22 @@ def whitened_along(
 ) -> list[Float[np.ndarray, "column _"]]:  # fmt: skip
     """One channel's columns, by recording, whitened beside an error that goes with what is read: the noise's variance
     and that of `ratio` times its size together. `shown` are the expected readings."""
-    w, every = np.concatenate(weight), np.concatenate(columns, axis=1)
+    w = np.concatenate(weight)
     shapes = Shapes.over(shown, times, w > 0, moving, curve)
-    whole = np.concatenate([shapes(x, t) for x, t in zip(shown, times, strict=True)])
-    rest = np.where(w > 0, whole.T, 0.0) * np.sqrt(w)
+    roots = [np.sqrt(one) for one in weight]
+    whole = [shapes(x, t).T * root for x, t, root in zip(shown, times, roots, strict=True)]
+    return cleared_of([x * root for x, root in zip(columns, roots, strict=True)], whole, ratio)
+
+
+def cleared_of(
+    columns: Sequence[Float[np.ndarray, "column _"]], shapes: Sequence[Float[np.ndarray, "shape _"]], ratio: float
+) -> list[Float[np.ndarray, "column _"]]:
+    """Columns of white noise, by recording, whitened beside shapes that share a variance of `ratio` times its own."""
+    every, rest = np.concatenate(columns, axis=1), np.concatenate(shapes, axis=1)
     _, sizes, ways = np.linalg.svd(rest, full_matrices=False)
     less = 1.0 - 1.0 / np.sqrt(1.0 + ratio / len(rest) * sizes**2)
-    every = every * np.sqrt(w)
     done = every - (every @ ways.T * less) @ ways
-    return np.split(done, np.cumsum([len(one) for one in weight])[:-1], axis=1)
+    return np.split(done, np.cumsum([one.shape[1] for one in columns])[:-1], axis=1)
 
 
 def _sizes(problem: Problem, one: _Channel, j: int, known: float, precision: Float[np.ndarray, " plain"]) -> Sizes:

@@ -10,6 +10,7 @@ from .._effects import GAIN, HIDDEN, Oscillating
 from ._constant import constant_evidence
 from ._found import Ahead, Found, speaker
 from ._problem import Combination, Problem
+from ._static import LARGEST
 from ._strength import faint_share
 from ._weighed import Estimate
 
@@ -81,7 +82,11 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
             evidences[combination] = max(plain, noisy - np.log(remainder))
             continue
         total = evidences[combination] = float(np.logaddexp(plain + np.log(1.0 - _BESIDE), noisy))
-        if any(e.converged for e in estimates) and _informed(problem, found, combination):
+        if (
+            any(e.converged for e in estimates)
+            and _informed(problem, found, combination)
+            and not _is_remainder(problem, found, combination)
+        ):
             price = found.prices.log(combination)
             # What explains less than it leaves, and was not seen to predict anything, is not what was left out.
             if found.ahead and not _predicts(found.ahead.get(combination)):
@@ -148,6 +153,21 @@ def _faint(problem: Problem, found: Found, combination: Combination) -> float | 
     best = max(found.estimates[combination], key=lambda e: e.log_evidence)
     sd = float(np.sqrt(best.covariance[place.start, place.start]) / found.priors.scales[one.first])
     return faint_share(sd) if sd < _UNINFORMED else None
+
+
+def _is_remainder(problem: Problem, found: Found, combination: Combination) -> bool:
+    """Whether a law of place without a word that a combination holds, beside findings, is as small as what counts as a
+    remainder there."""
+    number = sum(int((~np.isnan(rows.readings[: rows.fitted])).sum()) for rows in problem.rows)
+    for member in combination:
+        law, rest = problem.candidate(member).nameless, tuple(m for m in combination if m != member)
+        if law is None or law.kind != "conservative" or len(law.places) > 1 or not found.of(rest, "static"):
+            continue
+        gain = max(e.log_evidence for e in found.estimates[combination] if e.kind == "white")
+        white = found.of(rest, "white")
+        if white is not None and gain - white.log_evidence < 0.5 * LARGEST**2 * number:
+            return True
+    return False
 
 
 def _mixture(values: Float[np.ndarray, " kind"]) -> float:

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ._calibrate import Fits, weights
-from ._clock import whitened_beside
+from ._clock_errors import whitened_beside
 from ._coloured import whitened_series
-from ._positional import whitened_along
+from ._positional import cleared_of, whitened_along
 from ._problem import Problem
 from ._weighed import Estimate
 
@@ -47,6 +47,24 @@ def _channel(
     if estimate.kind == "coloured":
         return [whitened_series(x, w, t, estimate.colours[j]).T for x, w, t in zip(columns, own, times, strict=True)]
     if estimate.kind == "clock":
-        return whitened_beside(columns, shown, own, times, (estimate.colours[j], estimate.clocks[j]))
+        return _beside_a_clock(estimate, j, columns, shown, own, times)
     curve = bool(estimate.bends) and estimate.bends[j].shapes.curve
     return whitened_along(columns, shown, times, own, estimate.bent[j], estimate.kind == "kinematic", curve)
+
+
+def _beside_a_clock(
+    estimate: Estimate, j: int, columns: Sequence[Float[np.ndarray, "column _"]],
+    shown: Sequence[Float[np.ndarray, " _"]], weight: Sequence[Float[np.ndarray, " _"]],
+    times: Sequence[Float[np.ndarray, " _"]],
+) -> list[Float[np.ndarray, "column _"]]:  # fmt: skip
+    """The same beside errors of the sensor and its clock, and beside the curve that may go with them."""
+    both = estimate.colours[j], estimate.clocks[j]
+    if not estimate.bends:
+        return whitened_beside(columns, shown, weight, times, both)
+    curves = [
+        np.where(w > 0, estimate.bends[j].shapes(x, t).T, 0.0) for w, x, t in zip(weight, shown, times, strict=True)
+    ]
+    joint = [np.concatenate(pair) for pair in zip(columns, curves, strict=True)]
+    done = whitened_beside(joint, shown, weight, times, both)
+    number = len(columns[0])
+    return cleared_of([x[:number] for x in done], [x[number:] for x in done], estimate.bent[j])
