@@ -102,7 +102,7 @@ def test_every_law_between_two_is_what_it_says():
             assert (abs(number[0] + number[1]) < 1e-12) == (kind == "between")
         else:
             assert len(law.places) == 1
-    assert kinds == {"potential": 4, "across": 2, "between": 1, "along": 1, "own or one-sided": 14, "circulatory": 1}
+    assert kinds == {"potential": 4, "across": 2, "between": 1, "along": 1, "own or one-sided": 16, "circulatory": 1}
 
 
 def test_laws_share_half_of_the_share_of_what_has_no_name():

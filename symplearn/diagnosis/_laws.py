@@ -12,7 +12,7 @@ from .._kinks import Absolute
 from .._simulation_records import SimulationFile
 from .._symbolic import derivative
 
-# Coordinates up to which forces between some of them are tried: there are thirteen for every two.
+# Coordinates up to which forces between some of them are tried: there are fifteen for every two.
 _FEW = 3
 # Share of the prior of what has no name that simple laws have; the rest is of what none of them tells.
 _SHARE = 0.5
@@ -86,6 +86,7 @@ def _between(
     for k, m in ((i, j), (j, i)):
         yield Nameless((k,), ((q[m],),), words=f"goes with {names[m]}, which feels nothing of it")
         yield Nameless((k,), ((v[m],),), words=f"goes with the speed of {names[m]}, which feels nothing of it")
+        yield Nameless((k,), ((q[m] * v[k],),), words=f"goes with its speed and {names[m]}")
 
 
 def _of_three(three: tuple[int, int, int], names: tuple[str, ...], q: Sequence[sympy.Expr]) -> Nameless:

@@ -3,9 +3,12 @@
 Such a force repeats with the motion, and a part of it is like any stiffness of the vocabulary. It is a random function
 of one coordinate: Legendre polynomials over the range of the motion, which enter to first order about the trajectory
 and are integrated out. Where one side is as the other it has the odd ones alone, over a range that reaches as far on
-both. It is small: what the other unknowns do not take over has a prior rms of half the noise at most, shared evenly by
-all that it may look like in the readings. Shared evenly by the polynomials, nearly all of it would go to those that a
-parameter would take over if it were a little less known, and a force of the fifth power would owe ten nats more.
+both. It is small: what the other unknowns do not take over has a prior rms of half the noise at most.
+
+That is shared evenly by all that such a force may look like in the readings. Were it shared evenly by the polynomials,
+those that a parameter would take over if it were a little less known had nearly all of it: of a righting moment that was
+a little wrong a ship's roll told 8 nats so, 14 as it is, and 19 where the true power was named.
+
 A larger one is physics that was left out, and a stiffness has a name.
 """
 
