@@ -6,8 +6,8 @@ and are integrated out. Where one side is as the other it has the odd ones alone
 both. It is small: what the other unknowns do not take over has a prior rms of half the noise at most.
 
 That is shared evenly by all that such a force may look like in the readings. Were it shared evenly by the polynomials,
-those that a parameter would take over if it were a little less known had nearly all of it: of a righting moment that was
-a little wrong a ship's roll told 8 nats so, 14 as it is, and 19 where the true power was named.
+those that a parameter would take over if it were a little less known had nearly all of it: of a righting moment that
+was a little wrong a ship's roll told 8 nats so, 14 as it is, and 19 where the true power was named.
 
 A larger one is physics that was left out, and a stiffness has a name.
 """
