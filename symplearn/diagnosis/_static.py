@@ -1,15 +1,11 @@
 """A remainder in the dynamics that goes with place: a force that is small and static, as of a slightly wrong geometry.
 
 Such a force repeats with the motion, and a part of it is like any stiffness of the vocabulary. It is a random function
-of one coordinate: Legendre polynomials over the range of the motion, which enter to first order about the trajectory
-and are integrated out. Where one side is as the other it has the odd ones alone, over a range that reaches as far on
-both. It is small: what the other unknowns do not take over has a prior rms of half the noise at most.
-
-That is shared evenly by all that such a force may look like in the readings. Were it shared evenly by the polynomials,
-those that a parameter would take over if it were a little less known had nearly all of it: of a righting moment that
-was a little wrong a ship's roll told 8 nats so, 14 as it is, and 19 where the true power was named.
-
-A larger one is physics that was left out, and a stiffness has a name.
+of one coordinate: Legendre polynomials over the range of the motion with independent amplitudes of one size, which
+enter to first order about the trajectory and are integrated out. Where one side is as the other it has the odd ones
+alone, over a range that reaches as far on both. Or it is the fourth or the fifth power alone, which an expansion that has
+names for the first three goes on with. It is small: what the other unknowns do not take over has a prior rms of half
+the noise at most. A larger one is physics that was left out, and a stiffness has a name.
 """
 
 from collections.abc import Sequence
@@ -33,20 +29,19 @@ from ._weighed import Estimate, amplitudes_out, correlated, standardised
 _FORCES = (*POWERS, *SHAPES)
 # Sizes that are tried: root mean squares that the force leaves in the readings, against their noise.
 LARGEST = 0.5
-_SIZES = (LARGEST / 8, LARGEST / 4, LARGEST / 2, LARGEST)
-# Share of a response that the other unknowns leave, below which it is round-off; and share of the square of the most
-# visible sum of shapes below which one has no more room than it has there: it would be a large force that nobody sees.
-_ROUND_OFF, _VISIBLE = 1e-9, 1e-2
+_SIZES = (LARGEST / 4, LARGEST / 2, LARGEST)
+# Share of a response that the other unknowns leave, below which it is round-off.
+_ROUND_OFF = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class _Push:
     """A force of place on one coordinate: what a unit of each shape does to all readings, by recording; Gram matrices
-    of [error, slopes, responses] by channel, the last to `sums` of shapes, which enter with unit variance."""
+    of [error, slopes, responses] by channel, the last in units of `scale`, the size of each shape's amplitude."""
 
     responses: Sequence[Float[np.ndarray, "amplitude _ channel"]]
     grams: Float[np.ndarray, "channel column column"]
-    sums: Float[np.ndarray, "shape sum"]
+    scale: float
 
     @property
     def is_finite(self) -> bool:
@@ -57,8 +52,7 @@ class _Push:
 def weigh_static(stepper: Stepper, fits: Fits, priors: Priors, rows: Sequence[int]) -> list[Estimate]:
     """Estimates beside a small force that goes with one coordinate, about the trajectory fit.
 
-    Which coordinate, how large, and whether one side is as the other: on average over all of each; numbers are those
-    of the likeliest.
+    Which coordinate, how large, and of which shapes: on average over all of each; numbers are those of the likeliest.
     """
     problem, weight = stepper.problem, weights(stepper.problem, rows)
     r, out = residuals(problem, fits.predictions, weight), []
@@ -66,8 +60,8 @@ def weigh_static(stepper: Stepper, fits: Fits, priors: Priors, rows: Sequence[in
         tried, errors = [], [x[b] for x in r]
         for one in responses:
             gram = _gram(problem, fits, b, errors, weight, one)
-            sums = _noise_sized(problem, fits, b, gram, weight, priors)
-            some = [_Push(one, _summed(gram, problem, size * sums), size * sums) for size in _SIZES]
+            unit = _noise_sized(problem, fits, b, gram, weight, priors)
+            some = [_Push(one, _scaled(gram, problem, size * unit), size * unit) for size in _SIZES]
             tried += [(_weighed(problem, fits, b, push, weight, priors), push) for push in some if push.is_finite]
         if tried:
             value = float(logsumexp([one.log_evidence for one, _ in tried]) - np.log(len(responses) * len(_SIZES)))
@@ -101,14 +95,17 @@ def _candidate(problem: Problem, power: int, place: int) -> int:
 
 
 def _families(q: Float[np.ndarray, " row"]) -> list[Float[np.ndarray, "amplitude power"]]:
-    """Shapes of a force over the range of a motion: all, and those of a force that is odd in the coordinate.
+    """Shapes of a force over the range of a motion: all, those of a force that is odd in the coordinate, and single powers
+    that have no name.
 
     A wrong geometry may keep the symmetry that the right one has; even shapes, which it then lacks, would cost as much
-    as the data are sure of that.
+    as the data are sure of that. Of all shapes together those have the most room that a parameter would take over if it
+    were a little less known.
     """
-    reach = float(np.abs(q).max())
-    odd = np.arange(len(_FORCES)) % 2 == 1
-    return [_polynomials(float(q.min()), float(q.max())), np.where(odd[:, None], _polynomials(-reach, reach), 0.0)]
+    reach, number = float(np.abs(q).max()), np.arange(len(_FORCES))
+    odd = np.where(number[:, None] % 2 == 1, _polynomials(-reach, reach), 0.0)
+    powers = [np.outer(number == k, (number == k) / (reach or 1.0) ** k) for k in range(len(POWERS), len(_FORCES))]
+    return [_polynomials(float(q.min()), float(q.max())), odd, *powers]
 
 
 def _polynomials(low: float, high: float) -> Float[np.ndarray, "amplitude power"]:
@@ -140,32 +137,23 @@ def _gram(
 
 def _noise_sized(
     problem: Problem, fits: Fits, b: int, gram: np.ndarray, weight: Sequence[np.ndarray], priors: Priors
-) -> Float[np.ndarray, "shape sum"]:
-    """Sums of shapes of which each leaves as much in the readings, and of another kind, and all together as much as
-    their noise is; none of what the other unknowns take over."""
+) -> float:
+    """Amplitude of every shape at which they leave as much in the readings as their noise is; infinite where the other
+    unknowns take over all of it."""
     total = (gram / (fits.noise[b] ** 2)[:, None, None]).sum(0)
     combination, rest = fits.combinations[b], np.arange(1 + problem.size, len(total))
     free = np.nonzero(problem.active(combination))[0]
     held = total[np.ix_(1 + free, 1 + free)] + np.diag(priors.precision_of(problem, combination)[free])
     cross = total[np.ix_(1 + free, rest)]
-    whole = total[np.ix_(rest, rest)]
-    left = whole - cross.T @ inverse(held) @ cross
-    if not np.isfinite(left).all():
-        return np.full_like(left, np.inf)
-    squares, ways = np.linalg.eigh(left)
-    seen = squares > _ROUND_OFF * np.trace(whole)
-    number = sum((w > 0).sum() for w in weight) / max(seen.sum(), 1)
-    room = np.maximum(squares, _VISIBLE * squares[-1])
-    return np.asarray(ways * np.where(seen, np.sqrt(number / np.where(seen, room, 1.0)), 0.0))
+    whole = float(np.trace(total[np.ix_(rest, rest)]))
+    left = whole - float(np.trace(cross.T @ inverse(held) @ cross))
+    return float(np.sqrt(sum((w > 0).sum() for w in weight) / left)) if left > _ROUND_OFF * whole else np.inf
 
 
-def _summed(
-    gram: Float[np.ndarray, "channel column column"], problem: Problem, sums: Float[np.ndarray, "shape sum"]
-) -> Float[np.ndarray, "channel column column"]:
-    """The same with the responses to sums of shapes in place of those to shapes."""
-    turn = np.eye(gram.shape[1])
-    turn[1 + problem.size :, 1 + problem.size :] = sums
-    return np.asarray(turn.T @ gram @ turn)
+def _scaled(gram: Float[np.ndarray, "channel column column"], problem: Problem, size: float) -> np.ndarray:
+    """The same with responses in units of a size."""
+    unit = np.where(np.arange(gram.shape[1]) > problem.size, size, 1.0)
+    return np.asarray(gram * np.outer(unit, unit))
 
 
 def _weighed(
@@ -185,7 +173,7 @@ def _told(
     leaves."""
     column = np.concatenate([[1.0], fits.z[b] - one.z])
     follow = amplitudes_out((push.grams / (one.noise**2)[:, None, None]).sum(0), 1 + problem.size)[1]
-    amplitudes, left, scores = push.sums @ (follow @ column), [], []
+    amplitudes, left, scores = push.scale * (follow @ column), [], []
     for k, (x, w) in enumerate(zip(errors, weight, strict=True)):
         slopes = fits.predictions[k].slopes[b]
         rest = x + np.einsum("z,ztj->tj", column[1 + problem.local(k)], slopes)

@@ -16,6 +16,9 @@ from ._trajectory import Stepper
 
 # A remainder of the sensor is smaller than this share of what it reads; else it is the signal.
 REMAINDER = 0.3
+# How often white noise and the unknowns are found in turn at most, and the share of the former by which it still moves:
+# the likelihood is stationary in it, so that it is off by the square of that.
+_TURNS, _SETTLED = 6, 1e-5
 
 
 @dataclass(frozen=True)
@@ -178,7 +181,7 @@ def correlated(
     """
     combination, noise = fits.combinations[b], fits.noise[b].copy()
     free = np.isnan(problem.noise_of(combination))
-    for _ in range(6):
+    for _ in range(_TURNS):
         gram, follow, log = amplitudes_out((grams / (noise**2)[:, None, None]).sum(0), 1 + problem.size)
         offset = -0.5 * float((number * np.log(2 * np.pi * noise**2) + logs).sum() + log)
         one = _laplace(problem, combination, gram, offset, fits.z[b], priors)
@@ -186,7 +189,10 @@ def correlated(
         column = np.concatenate([[1.0], fits.z[b] - z])
         column = np.concatenate([column, -follow @ column])
         square = np.einsum("i,jik,k->j", column, grams, column)
+        before = noise
         noise = np.where(free, np.sqrt(np.maximum(square, 1e-300) / np.maximum(number, 1)), noise)
+        if (np.abs(noise - before) <= _SETTLED * before).all():
+            break
     # A step may be too small for the numbers it is added to: where a trajectory is that sensitive it ran away, and what
     # the step would have gained is not there.
     lost = _misfit(gram, fits.z[b] - z) - _misfit(gram, -one.step)
