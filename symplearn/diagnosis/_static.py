@@ -3,9 +3,9 @@
 Such a force repeats with the motion, and a part of it is like any stiffness of the vocabulary. It is a random function
 of one coordinate: Legendre polynomials over the range of the motion with independent amplitudes of one size, which
 enter to first order about the trajectory and are integrated out. Where one side is as the other it has the odd ones
-alone, over a range that reaches as far on both. Or it is the fourth or the fifth power alone, which an expansion that has
-names for the first three goes on with. It is small: what the other unknowns do not take over has a prior rms of half
-the noise at most. A larger one is physics that was left out, and a stiffness has a name.
+alone, over a range that reaches as far on both. Or it is the fourth or the fifth power alone, with which an expansion
+goes on whose first three have a name. It is small: what the other unknowns do not take over has a prior rms of half the
+noise at most. A larger one is physics that was left out, and a stiffness has a name.
 """
 
 from collections.abc import Sequence
@@ -95,8 +95,8 @@ def _candidate(problem: Problem, power: int, place: int) -> int:
 
 
 def _families(q: Float[np.ndarray, " row"]) -> list[Float[np.ndarray, "amplitude power"]]:
-    """Shapes of a force over the range of a motion: all, those of a force that is odd in the coordinate, and single powers
-    that have no name.
+    """Shapes of a force over the range of a motion: all, those of a force that is odd in the coordinate, and single
+    powers that have no name.
 
     A wrong geometry may keep the symmetry that the right one has; even shapes, which it then lacks, would cost as much
     as the data are sure of that. Of all shapes together those have the most room that a parameter would take over if it
