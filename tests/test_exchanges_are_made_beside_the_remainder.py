@@ -11,6 +11,7 @@ from test_a_clock_may_wander import TIMES as LATE
 from test_a_clock_may_wander import late, problem, swing
 from test_coloured_errors_are_whitened import autocovariance
 
+from symplearn.diagnosis._bend import Bend, Shapes
 from symplearn.diagnosis._calibrate import calibrate, weights
 from symplearn.diagnosis._coloured import Colour
 from symplearn.diagnosis._exchange import Regression
@@ -53,17 +54,21 @@ def covariances(kind, fits, weight, times):
     S, first = np.zeros((total, total)), 0
     for t, rate in zip(times, rates, strict=True):
         own = slice(first, first + len(t))
-        if kind in ("coloured", "clock"):
+        if kind in ("coloured", "clock", "askew"):
             S[own, own] = COLOUR.ratio * autocovariance(t[:, None] - t, COLOUR.frequency, COLOUR.damping)
-        if kind == "clock":
+        if kind in ("clock", "askew"):
             late = CLOCK.ratio * autocovariance(t[:, None] - t, CLOCK.frequency, CLOCK.damping)
             S[own, own] += np.outer(rate, rate) * late / size**2
         first += len(t)
     seen = np.concatenate(weight) > 0
+    moving = [np.gradient(x, t, edge_order=2) for x, t in zip(shown, times, strict=True)]
+    if kind == "askew":
+        q, v = (place(np.concatenate(x), seen) for x in (shown, moving))
+        shapes = np.stack([np.sqrt(5) * q**2, np.sqrt(7) * q**3, 3 * q * v, np.sqrt(5) * v**2])
+        S += BENT * shapes.T @ shapes / 4
     if kind in ("positional", "kinematic"):
         shapes = thirteen(np.concatenate(shown), seen)
         if kind == "kinematic":
-            moving = [np.gradient(x, t, edge_order=2) for x, t in zip(shown, times, strict=True)]
             shapes = np.concatenate([shapes, thirteen(np.concatenate(moving), seen)[1:]])
         S = BENT * shapes.T @ shapes / len(shapes)
     return S[np.ix_(seen, seen)] + np.diag(1 / np.concatenate(weight)[seen]), seen
@@ -71,19 +76,27 @@ def covariances(kind, fits, weight, times):
 
 def thirteen(x, seen):
     """Polynomials over the range that was read, of equal variances."""
-    place = np.clip(2 * (x - x[seen].min()) / np.ptp(x[seen]) - 1, -1.0, 1.0)
-    return np.stack([np.sqrt(2 * k + 1) * Legendre.basis(k)(place) for k in range(13)])
+    return np.stack([np.sqrt(2 * k + 1) * Legendre.basis(k)(place(x, seen)) for k in range(13)])
 
 
-@pytest.mark.parametrize("kind", ["coloured", "clock", "positional", "kinematic"])
+def place(x, seen):
+    """Where in the range that was read something is, from -1 to 1."""
+    return np.clip(2 * (x - x[seen].min()) / np.ptp(x[seen]) - 1, -1.0, 1.0)
+
+
+@pytest.mark.parametrize("kind", ["coloured", "clock", "askew", "positional", "kinematic"])
 def test_products_of_whitened_columns_are_the_dense_gaussian_process(kind, fitted):
-    """For every kind of remainder, two recordings at irregular times with readings missing: NumPy's solution with the
-    covariance of all readings."""
+    """For every kind of remainder, a clock with a curve of place and speed among them, two recordings at uneven times
+    with readings missing: NumPy's solution with the covariance of all readings."""
     p, fits, rows = fitted
     weight = [w[:, 0] for w in weights(p, rows)]
     nothing = np.zeros((p.size, p.size))
     estimate = Estimate((), kind, fits.z[0], nothing, np.array([LEFT]), 0.0, True, colours=(COLOUR,), bent=(BENT,),
                         clocks=(CLOCK,))  # fmt: skip
+    if kind == "askew":
+        shown, times = [x.readings[0, :, 0] for x in fits.predictions], [r.times for r in p.rows]
+        shapes = Shapes.over(shown, times, np.concatenate(weight) > 0, moving=True, curve=True)
+        estimate = replace(estimate, kind="clock", bends=(Bend(shapes, np.zeros(4), 0.0),))
     S, seen = covariances(kind, fits, weight, [r.times for r in p.rows])
     columns = np.random.default_rng(4).normal(size=(3, len(seen))) * seen
     root = np.sqrt(np.concatenate(weight)) / fits.noise[0]

@@ -132,7 +132,7 @@ def _mixed(*ways: list[Estimate]) -> Estimate:
     """The likeliest of several ways, each of the same weight in all, with the evidence of all of them."""
     listed = [one for way in ways for one in way]
     share = np.concatenate([np.full(len(way), 1.0 / (len(ways) * len(way))) for way in ways])
-    values = np.nan_to_num([one.log_evidence for one in listed], nan=-np.inf)
+    values = np.nan_to_num([one.log_evidence for one in listed], nan=-np.inf, neginf=-np.inf)
     best = listed[int((values + np.log(share)).argmax())]
     return replace(best, log_evidence=float(logsumexp(values, b=share)))
 
@@ -156,7 +156,7 @@ def _integrated(lane: _Lane, both: Both, size: Float[np.ndarray, " channel"]) ->
     follow = amplitudes_out(total, 1 + problem.size)[1]
     column = np.concatenate([[1.0], fits.z[b] - one.z])
     amplitudes = (follow @ column).reshape(problem.channels, -1) * unit[:, None]
-    rest = total[1 + problem.size :, 1 + problem.size :]
+    rest = np.nan_to_num(total[1 + problem.size :, 1 + problem.size :])  # a trajectory that ran away
     own = np.arange(len(rest)).reshape(problem.channels, -1)
     spread = np.stack(
         [np.linalg.inv(rest[np.ix_(k, k)] + np.eye(len(k))) * u**2 for k, u in zip(own, unit, strict=True)]
