@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import logsumexp
 
+from ._bearers import largest
 from ._bend import Bend, Shapes
 from ._calibrate import Fits, Priors, residuals, weights
 from ._clock_errors import Piece, cleared, fitted, pieces_of
@@ -116,13 +117,15 @@ def _straight(lane: _Lane, begins: list[Both]) -> _Known:
 
 
 def _curved(lane: _Lane, straight: _Known) -> list[Estimate]:
-    """Beside a curve of each size, too; of the likeliest size the errors of sensor and clock are fitted again."""
-    noise = straight.estimate.noise
-    tried = [_integrated(lane, straight.both, size * noise) for size in _CURVES]
+    """Beside a curve of each size, too, none larger than a remainder may be; of the likeliest size the errors of sensor
+    and clock are fitted again."""
+    most = np.array([largest(lane.problem, j) for j in range(lane.problem.channels)])
+    sizes = [np.minimum(size * straight.estimate.noise, most) for size in _CURVES]
+    tried = [_integrated(lane, straight.both, size) for size in sizes]
     best = int(np.argmax(np.nan_to_num([one.estimate.log_evidence for one in tried], nan=-np.inf)))
     one = tried[best]
     both = _refitted(lane, one.estimate.z, one.amplitudes, [one.both])
-    again = _integrated(lane, both, _CURVES[best] * noise)
+    again = _integrated(lane, both, sizes[best])
     if again.estimate.log_evidence > one.estimate.log_evidence:
         tried[best] = again
     return [_told(lane, one) for one in tried]
