@@ -72,12 +72,25 @@ class _Lane:
 
 
 @dataclass(frozen=True, eq=False)
+class _White:
+    """A lane's columns whitened beside errors of sensors and clocks: by channel and recording, with the log
+    determinants that the whitening leaves."""
+
+    both: Both
+    series: list[list[tuple[Float[np.ndarray, "row column"], float]]]
+
+    @classmethod
+    def beside(cls, lane: _Lane, both: Both) -> "_White":
+        return cls(both, [[cleared(one, own) for one in pieces] for pieces, own in zip(lane.pieces, both, strict=True)])
+
+
+@dataclass(frozen=True, eq=False)
 class _Known:
     """What is known of a lane beside errors of sensors and clocks: the estimate, and its curves' amplitudes with what
     is not known of them."""
 
     estimate: Estimate
-    both: Both
+    white: _White
     amplitudes: Float[np.ndarray, "channel curve"]
     spread: Float[np.ndarray, "channel curve curve"]
 
@@ -111,8 +124,9 @@ def _straight(lane: _Lane, begins: list[Both]) -> _Known:
     """Beside errors of sensor and clock alone."""
     z, nothing = lane.fits.z[lane.b], np.zeros((lane.problem.channels, 0))
     for _ in range(_PASSES):  # what is off the path changes what the path is
-        known = _integrated(lane, _refitted(lane, z, nothing, begins), np.ones(len(nothing)))
-        z, begins = known.estimate.z, [known.both]
+        white = _White.beside(lane, _refitted(lane, z, nothing, begins))
+        known = _integrated(lane, white, np.ones(len(nothing)))
+        z, begins = known.estimate.z, [white.both]
     return known
 
 
@@ -121,11 +135,12 @@ def _curved(lane: _Lane, straight: _Known) -> list[Estimate]:
     and clock are fitted again."""
     most = np.array([largest(lane.problem, j) for j in range(lane.problem.channels)])
     sizes = [np.minimum(size * straight.estimate.noise, most) for size in _CURVES]
-    tried = [_integrated(lane, straight.both, size) for size in sizes]
+    white = _White.beside(lane, straight.white.both)
+    tried = [_integrated(lane, white, size) for size in sizes]
     best = int(np.argmax(np.nan_to_num([one.estimate.log_evidence for one in tried], nan=-np.inf)))
     one = tried[best]
-    both = _refitted(lane, one.estimate.z, one.amplitudes, [one.both])
-    again = _integrated(lane, both, sizes[best])
+    both = _refitted(lane, one.estimate.z, one.amplitudes, [white.both])
+    again = _integrated(lane, _White.beside(lane, both), sizes[best])
     if again.estimate.log_evidence > one.estimate.log_evidence:
         tried[best] = again
     return [_told(lane, one) for one in tried]
@@ -148,12 +163,12 @@ def _refitted(
             for j, own in enumerate(lane.pieces)]  # fmt: skip
 
 
-def _integrated(lane: _Lane, both: Both, size: Float[np.ndarray, " channel"]) -> _Known:
+def _integrated(lane: _Lane, white: _White, size: Float[np.ndarray, " channel"]) -> _Known:
     """Unknowns and curves, whose shapes have together this root mean square, integrated beside given errors."""
     problem, fits, b = lane.problem, lane.fits, lane.b
     unit = size / np.sqrt(max(lane.curves, 1))
-    grams, logs = zip(*(_gram(lane, j, both[j], unit[j]) for j in range(problem.channels)), strict=True)
-    occam = sum(colour.occam + clock.occam for colour, clock in both)
+    grams, logs = zip(*(_gram(lane, j, white, unit[j]) for j in range(problem.channels)), strict=True)
+    occam = sum(colour.occam + clock.occam for colour, clock in white.both)
     one = correlated(problem, fits, b, np.stack(grams), np.array(logs), lane.number, occam, lane.priors)
     total = (np.stack(grams) / (one.noise**2)[:, None, None]).sum(0)
     follow = amplitudes_out(total, 1 + problem.size)[1]
@@ -164,17 +179,16 @@ def _integrated(lane: _Lane, both: Both, size: Float[np.ndarray, " channel"]) ->
     spread = np.stack(
         [np.linalg.inv(rest[np.ix_(k, k)] + np.eye(len(k))) * u**2 for k, u in zip(own, unit, strict=True)]
     )
-    return _Known(one, both, amplitudes, spread)
+    return _Known(one, white, amplitudes, spread)
 
 
-def _gram(lane: _Lane, j: int, both: tuple[Colour, Colour], unit: float) -> tuple[np.ndarray, float]:
+def _gram(lane: _Lane, j: int, white: _White, unit: float) -> tuple[np.ndarray, float]:
     """Gram matrix of one channel's whitened columns, all recordings together, those of all channels' curves behind the
     unknowns; and the log determinants."""
     size, curves = 1 + lane.problem.size, lane.curves
     full, total = np.zeros((size + curves * lane.problem.channels,) * 2), 0.0
-    for k, one in enumerate(lane.pieces[j]):
+    for k, (series, log) in enumerate(white.series[j]):
         place = np.concatenate([[0], 1 + lane.problem.local(k), size + j * curves + np.arange(curves)])
-        series, log = cleared(one, both)
         series = series * np.where(place < size, 1.0, unit)
         full[np.ix_(place, place)] += series.T @ series
         total += log
@@ -187,14 +201,13 @@ def _told(lane: _Lane, known: _Known) -> Estimate:
     left = [lane.left(one.z, known.amplitudes, j) for j in range(lane.problem.channels)]
     for k in range(len(lane.problem.rows)):
         slopes = slice(1 + lane.problem.state, 1 + lane.problem.local(k).size)
-        series = [cleared(piece[k], shape)[0] / noise
-                  for piece, shape, noise in zip(lane.pieces, known.both, one.noise, strict=True)]  # fmt: skip
+        series = [own[k][0] / noise for own, noise in zip(known.white.series, one.noise, strict=True)]
         each = [np.where(piece[k].weight > 0, x @ column[k], np.nan)
                 for piece, x, column in zip(lane.pieces, series, left, strict=True)]  # fmt: skip
         errors.append(np.stack(each, axis=1))
         scores.append(sum((x @ column[k])[:, None] * x[:, slopes] for x, column in zip(series, left, strict=True)))
     value = one.log_evidence + law_gain(lane.problem, one.combination, np.concatenate(errors))
-    colours, clocks = zip(*known.both, strict=True)
+    colours, clocks = zip(*known.white.both, strict=True)
     inflation = variance_inflation(np.concatenate(scores))
     one = replace(one, kind="clock", log_evidence=value, colours=colours, clocks=clocks, inflation=inflation)
     return one if not lane.shapes else _with_curves(lane, known, one)

@@ -158,14 +158,13 @@ def _faint(problem: Problem, found: Found, combination: Combination) -> float | 
 def _is_remainder(problem: Problem, found: Found, combination: Combination) -> bool:
     """Whether a law of place without a word that a combination holds, beside findings, is as small as what counts as a
     remainder there."""
-    number = sum(int((~np.isnan(rows.readings[: rows.fitted])).sum()) for rows in problem.rows)
     for member in combination:
         law, rest = problem.candidate(member).nameless, tuple(m for m in combination if m != member)
         if law is None or law.kind != "conservative" or len(law.places) > 1 or not found.of(rest, "static"):
             continue
-        gain = max(e.log_evidence for e in found.estimates[combination] if e.kind == "white")
-        white = found.of(rest, "white")
-        if white is not None and gain - white.log_evidence < 0.5 * LARGEST**2 * number:
+        white, without = found.of(combination, "white"), found.of(rest, "white")
+        number = sum(int((~np.isnan(rows.readings[: rows.fitted])).sum()) for rows in problem.rows)
+        if white and without and white.log_evidence - without.log_evidence < 0.5 * LARGEST**2 * number:
             return True
     return False
 
