@@ -61,6 +61,7 @@ def searched(
             options.progress("weighing the best combinations again in finer steps")
             found = search.again(Stepper(finer, options.jobs))
     weigh_nameless(file, recordings, options, search)
+    search.settle()
     found = search.found
     options.progress("comparing how well answers predict ahead")
     look_ahead(search.stepper, found, search.rows)

@@ -107,6 +107,14 @@ class Found:
         total = float(logsumexp([mode.log_evidence for mode in modes])) if np.isfinite(top) else -np.inf
         return replace(better, log_evidence=total, modes=tuple(modes))
 
+    def settle(self, old: Estimate, new: Estimate) -> None:
+        """Put an estimate in the place of one of the same combination and kind whose point is not its own optimum."""
+        one = Mode(new.log_evidence, new.z, new.covariance)
+        modes = tuple(one if np.array_equal(mode.z, old.z) else mode for mode in old.modes)
+        total = float(logsumexp([mode.log_evidence for mode in modes]))
+        kinds = self.estimates[old.combination]
+        kinds[kinds.index(old)] = replace(new, log_evidence=total, modes=modes)
+
     def _apart(self, combination: Combination, a: Mode, b: Mode) -> bool:
         """Whether some effect has its place elsewhere."""
         for member, place in self.problem.placed(combination):

@@ -18,6 +18,7 @@ from ._prospects import MANY, Prospects, promising
 from ._refinement import Refinement
 from ._remainders import Remainders
 from ._score import Start
+from ._settle import settle
 from ._spells import Spells
 from ._start import priors_without_effects, with_states
 from ._stochastic import trajectories
@@ -189,6 +190,10 @@ class Search:
         self._weigh_spells()
         self._weigh_with_outliers_in()
         return self.found
+
+    def settle(self) -> None:
+        """Find the likeliest about their own optima."""
+        settle(self.weigher, self._is_mine)
 
     def goes_on(self, stepper: Stepper, priors: Priors) -> None:
         """Go on with a problem that has more candidates, behind those that this one has."""

@@ -60,6 +60,7 @@ class Estimate:
     jitters: tuple[float, ...] = ()  # variance of the error that single times make against the noise's
     modes: tuple[Mode, ...] = ()  # all optima that were found, this one among them
     outliers: tuple[tuple[float, float], ...] = ()  # share and size by channel, where they were left out
+    promised: float = 0.0  # nats that the step to it is to bring, beside a remainder
 
     @property
     def reading_noise(self) -> Float[np.ndarray, " channel"]:
@@ -200,7 +201,8 @@ def correlated(
     value += occam + strength_gain(problem, combination, priors, z, one.covariance)
     if (square < 0).any():  # round-off of a trajectory that ran away
         value = -np.inf
-    return Estimate(combination, "", z, one.covariance, noise, value, bool(fits.converged[b]))
+    converged, promised = bool(fits.converged[b]), one.promised
+    return Estimate(combination, "", z, one.covariance, noise, value, converged, promised=promised)
 
 
 def _misfit(gram: Float[np.ndarray, "column column"], change: Float[np.ndarray, " z"]) -> float:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from .._effects import OUTLIERS, STOP
 from ._along import along, readings
@@ -175,6 +176,25 @@ class Weigher:
         """Weigh combinations, fitted before, beside a small force that goes with place."""
         for one in weigh_static(self.stepper, self._as_fitted(combinations), self.found.priors, self.rows):
             self._add_beside_white(one)
+
+    def beside(self, estimate: Estimate, z: Float[np.ndarray, " z"]) -> Estimate:
+        """One beside the remainder of another, about `z`; its evidence is without what the step from there promises."""
+        p, own, rows = self.problem, [estimate.combination], self.rows
+        predictions = self.stepper.predict(z[None], own, rows)
+        fits = Fits(own, z[None], estimate.noise[None], predictions, np.zeros(1), np.zeros(1, bool))
+        priors, kind = self.found.priors, estimate.kind
+        if kind == "coloured":
+            (one,) = weigh_coloured(p, fits, priors, rows)
+        elif kind == "clock":
+            (one,) = weigh_clock(p, fits, priors, rows, [estimate.colours])
+        elif kind == "jitter":
+            (one,) = weigh_jitter(p, fits, priors, rows)
+        elif kind == "static":
+            (one,) = weigh_static(self.stepper, fits, priors, rows)
+        else:
+            (one,) = weigh_positional(p, fits, priors, rows, moving=kind == "kinematic")
+        owed = self._owed_beside(estimate.combination)
+        return replace(one, log_evidence=one.log_evidence + owed, outliers=estimate.outliers, converged=True)
 
     def _as_fitted(self, combinations: Sequence[Combination]) -> Fits:
         """Combinations as they were fitted under white noise."""

@@ -1,0 +1,64 @@
+"""Estimates beside a remainder, about their own optimum.
+
+What a remainder leaves of the unknowns is found in one linear step from the trajectory fit under white noise. Where
+that is long, as along the valley of a scale beside a free start, the trajectory there is another than the step foresaw:
+the step then is one of Gauss and Newton, and others follow it, halved where they do not help.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from ._found import within_bounds
+from ._problem import Combination
+from ._weighed import Estimate
+from ._weigher import Weigher
+
+# Remainders of a trajectory; a missing force is fitted as a path, to its end.
+_KINDS = ("coloured", "clock", "positional", "kinematic", "jitter", "static")
+# Estimates are settled that are within so many nats of the best, so many at most.
+_REACH, _MOST = 10.0, 12
+# Points that are tried at most; the nats that a settled estimate's further step would bring at most, and those by which
+# a step may miss what it foresaw and be as good as right.
+_POINTS, _SETTLED, _FORESEEN = 12, 0.02, 1.0
+
+
+def settle(weigher: Weigher, is_mine: Callable[[Combination], bool]) -> None:
+    """Settle the likeliest estimates, of the combinations that are the weigher's own."""
+    found, done = weigher.found, set[tuple[Combination, str]]()
+    while len(done) < _MOST:
+        least = max(map(found.odds, found.estimates)) - _REACH
+        near = [max(found.estimates[c], key=lambda e: e.log_evidence) for c in found.estimates if found.odds(c) > least]
+        left = [e for e in near if e.kind in _KINDS and (e.combination, e.kind) not in done and is_mine(e.combination)]
+        if not left:
+            return
+        old = max(left, key=lambda e: found.odds(e.combination))
+        done.add((old.combination, old.kind))
+        if (new := settled(weigher, old)) is not None:
+            found.settle(old, new)
+
+
+def settled(weigher: Weigher, old: Estimate) -> Estimate | None:
+    """An estimate about the best point that steps lead to; its evidence is that of the point, without what a further
+    step would bring. None where the evidence is no number at any of them."""
+    z = _allowed(weigher, old)
+    best, origin = weigher.beside(old, z), z
+    white = weigher.found.of(old.combination, "white")
+    if white is not None and not best.log_evidence > old.log_evidence - _FORESEEN:  # the step led too far
+        first = weigher.beside(old, white.z)
+        if not best.log_evidence > first.log_evidence:
+            best, origin = first, white.z
+    for _ in range(_POINTS):
+        if best.promised < _SETTLED:
+            return best
+        z = _allowed(weigher, best) if z is origin else (origin + z) / 2
+        one = weigher.beside(old, z)
+        if one.log_evidence > best.log_evidence:
+            best, origin = one, z
+    return replace(best, z=origin, converged=False) if np.isfinite(best.log_evidence) else None
+
+
+def _allowed(weigher: Weigher, estimate: Estimate) -> Float[np.ndarray, " z"]:
+    return within_bounds(weigher.problem, weigher.found.priors, estimate).z
