@@ -44,6 +44,14 @@ class _Lane:
     number: np.ndarray  # readings by channel
     shapes: tuple[Shapes, ...] = ()  # by channel
 
+    @classmethod
+    def of(cls, problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int], b: int) -> "_Lane":
+        """Without a curve."""
+        weight = weights(problem, rows)
+        errors = [x[b] for x in residuals(problem, fits.predictions, weight)]
+        pieces = [pieces_of(problem, fits, [x[:, j] for x in errors], weight, b, j) for j in range(problem.channels)]
+        return cls(problem, fits, priors, b, pieces, sum((w > 0).sum(0) for w in weight))
+
     @property
     def curves(self) -> int:
         """How many shapes a channel's curve has."""
@@ -104,13 +112,9 @@ def weigh_clock(
 
     `colours` are those of the sensors alone, by lane and channel. None for a combination with a wrongly given noise.
     """
-    weight = weights(problem, rows)
-    errors = residuals(problem, fits.predictions, weight)
-    number = sum((w > 0).sum(0) for w in weight)
     out: list[Estimate] = []
     for b in trusting(problem, fits):
-        pieces = [pieces_of(problem, fits, [x[b, :, j] for x in errors], weight, b, j) for j in range(problem.channels)]
-        lane = _Lane(problem, fits, priors, b, pieces, number)
+        lane = _Lane.of(problem, fits, priors, rows, b)
         begins: list[Both] = [[(colour, replace(colour, ratio=0.0)) for colour in colours[b]]]
         if out:  # the errors beside another law, too: each search may be caught in an optimum of its own
             best = max(out, key=lambda one: one.log_evidence)
@@ -118,6 +122,17 @@ def weigh_clock(
         straight = _straight(lane, begins)
         out.append(_mixed([_told(lane, straight)], _curved(lane.bent(), straight)))
     return out
+
+
+@np.errstate(all="ignore")  # a lane that diverged is told by its evidence
+def weigh_known_clock(problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int], like: Estimate) -> Estimate:
+    """The only lane beside the errors of sensor and clock that another estimate has, and beside a curve where that has
+    one: of its sizes the likeliest, which is granted all of their weight."""
+    lane = _Lane.of(problem, fits, priors, rows, 0)
+    lane = lane.bent() if like.bends else lane
+    white = _White.beside(lane, list(zip(like.colours, like.clocks, strict=True)))
+    tried = [_integrated(lane, white, size) for size in (_sizes(lane, like.noise) if like.bends else [like.noise])]
+    return _told(lane, max(tried, key=lambda one: np.nan_to_num(one.estimate.log_evidence, nan=-np.inf)))
 
 
 def _straight(lane: _Lane, begins: list[Both]) -> _Known:
@@ -133,8 +148,7 @@ def _straight(lane: _Lane, begins: list[Both]) -> _Known:
 def _curved(lane: _Lane, straight: _Known) -> list[Estimate]:
     """Beside a curve of each size, too, none larger than a remainder may be; of the likeliest size the errors of sensor
     and clock are fitted again."""
-    most = np.array([largest(lane.problem, j) for j in range(lane.problem.channels)])
-    sizes = [np.minimum(size * straight.estimate.noise, most) for size in _CURVES]
+    sizes = _sizes(lane, straight.estimate.noise)
     white = _White.beside(lane, straight.white.both)
     tried = [_integrated(lane, white, size) for size in sizes]
     best = int(np.argmax(np.nan_to_num([one.estimate.log_evidence for one in tried], nan=-np.inf)))
@@ -144,6 +158,12 @@ def _curved(lane: _Lane, straight: _Known) -> list[Estimate]:
     if again.estimate.log_evidence > one.estimate.log_evidence:
         tried[best] = again
     return [_told(lane, one) for one in tried]
+
+
+def _sizes(lane: _Lane, noise: Float[np.ndarray, " channel"]) -> list[Float[np.ndarray, " channel"]]:
+    """Root mean squares of a curve that are tried, by channel."""
+    most = np.array([largest(lane.problem, j) for j in range(lane.problem.channels)])
+    return [np.minimum(size * noise, most) for size in _CURVES]
 
 
 def _mixed(*ways: list[Estimate]) -> Estimate:

@@ -23,6 +23,8 @@ _REACH, _MOST = 10.0, 12
 # Points that are tried at most; the nats that a settled estimate's further step would bring at most, and those by which
 # a step may miss what it foresaw and be as good as right.
 _POINTS, _SETTLED, _FORESEEN = 12, 0.02, 1.0
+# What errors of a clock that are taken as known may owe for others that were weighed with them, in nats.
+_OWED = (-3.0, 0.0)
 
 
 def settle(weigher: Weigher, is_mine: Callable[[Combination], bool]) -> None:
@@ -44,20 +46,25 @@ def settled(weigher: Weigher, old: Estimate) -> Estimate | None:
     """An estimate about the best point that steps lead to; its evidence is that of the point, without what a further
     step would bring. None where the evidence is no number at any of them."""
     z = _allowed(weigher, old)
-    best, origin = weigher.beside(old, z), z
+    best, origin, owed = weigher.beside(old, z), z, 0.0
     white = weigher.found.of(old.combination, "white")
-    if white is not None and not best.log_evidence > old.log_evidence - _FORESEEN:  # the step led too far
+    is_known = old.kind == "clock"  # whose errors are those of the old estimate, and not looked for again
+    if white is not None and (is_known or not best.log_evidence > old.log_evidence - _FORESEEN):
         first = weigher.beside(old, white.z)
-        if not best.log_evidence > first.log_evidence:
+        if not best.log_evidence > first.log_evidence:  # the step led too far
             best, origin = first, white.z
+        if is_known:
+            owed = float(np.clip(old.log_evidence - first.log_evidence - first.promised, *_OWED))
     for _ in range(_POINTS):
         if best.promised < _SETTLED:
-            return best
+            return replace(best, log_evidence=best.log_evidence + owed)
         z = _allowed(weigher, best) if z is origin else (origin + z) / 2
         one = weigher.beside(old, z)
         if one.log_evidence > best.log_evidence:
             best, origin = one, z
-    return replace(best, z=origin, converged=False) if np.isfinite(best.log_evidence) else None
+    if not np.isfinite(best.log_evidence):
+        return None
+    return replace(best, z=origin, log_evidence=best.log_evidence + owed, converged=False)
 
 
 def _allowed(weigher: Weigher, estimate: Estimate) -> Float[np.ndarray, " z"]:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from .._effects import OUTLIERS, STOP
 from ._along import along, readings
 from ._calibrate import Fits, Priors, grow, residuals, weights
-from ._clock import weigh_clock
+from ._clock import weigh_clock, weigh_known_clock
 from ._found import Found
 from ._jitter import weigh_jitter
 from ._noisy import PathFit, fit_paths
@@ -186,7 +186,7 @@ class Weigher:
         if kind == "coloured":
             (one,) = weigh_coloured(p, fits, priors, rows)
         elif kind == "clock":
-            (one,) = weigh_clock(p, fits, priors, rows, [estimate.colours])
+            one = weigh_known_clock(p, fits, priors, rows, estimate)
         elif kind == "jitter":
             (one,) = weigh_jitter(p, fits, priors, rows)
         elif kind == "static":
