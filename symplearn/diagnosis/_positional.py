@@ -103,7 +103,7 @@ def weigh_positional(
     out = []
     for b in range(len(fits.combinations)):
         ways = [_weighed(problem, fits, b, priors, rows, moving, curve) for curve in (True, False)]
-        values = np.nan_to_num([one.log_evidence for one in ways], nan=-np.inf)
+        values = np.nan_to_num([one.log_evidence for one in ways], nan=-np.inf, neginf=-np.inf)
         value = float(np.logaddexp.reduce(values)) - float(np.log(len(ways)))
         out.append(replace(ways[int(values.argmax())], log_evidence=value))
     return out

@@ -193,7 +193,9 @@ class Search:
 
     def settle(self) -> None:
         """Find the likeliest about their own optima."""
-        settle(self.weigher, self._is_mine)
+        if self.in_time():
+            self.progress("following the likeliest to their own optima")
+            settle(self.weigher, self._is_mine)
 
     def goes_on(self, stepper: Stepper, priors: Priors) -> None:
         """Go on with a problem that has more candidates, behind those that this one has."""

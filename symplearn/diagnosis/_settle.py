@@ -16,8 +16,9 @@ from ._problem import Combination
 from ._weighed import Estimate
 from ._weigher import Weigher
 
-# Remainders of a trajectory; a missing force is fitted as a path, to its end.
-_KINDS = ("coloured", "clock", "positional", "kinematic", "jitter", "static")
+# Remainders of the readings alone. A missing force is fitted as a path, to its end; what a small force that goes with
+# place takes over from the parameters a trajectory without it, about which it would be settled, knows nothing of.
+_KINDS = ("coloured", "clock", "positional", "kinematic", "jitter")
 # Estimates are settled that are within so many nats of the best, so many at most.
 _REACH, _MOST = 10.0, 12
 # Points that are tried at most; the nats that a settled estimate's further step would bring at most, and those by which
@@ -56,7 +57,7 @@ def settled(weigher: Weigher, old: Estimate) -> Estimate | None:
         if is_known:
             owed = float(np.clip(old.log_evidence - first.log_evidence - first.promised, *_OWED))
     for _ in range(_POINTS):
-        if best.promised < _SETTLED:
+        if best.promised < _SETTLED and np.isfinite(best.log_evidence):
             return replace(best, log_evidence=best.log_evidence + owed)
         z = _allowed(weigher, best) if z is origin else (origin + z) / 2
         one = weigher.beside(old, z)

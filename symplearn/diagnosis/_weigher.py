@@ -178,7 +178,8 @@ class Weigher:
             self._add_beside_white(one)
 
     def beside(self, estimate: Estimate, z: Float[np.ndarray, " z"]) -> Estimate:
-        """One beside the remainder of another, about `z`; its evidence is without what the step from there promises."""
+        """One beside the remainder of another, which is one of the readings alone, about `z`; its evidence is without
+        what the step from there promises."""
         p, own, rows = self.problem, [estimate.combination], self.rows
         predictions = self.stepper.predict(z[None], own, rows)
         fits = Fits(own, z[None], estimate.noise[None], predictions, np.zeros(1), np.zeros(1, bool))
@@ -189,8 +190,6 @@ class Weigher:
             one = weigh_known_clock(p, fits, priors, rows, estimate)
         elif kind == "jitter":
             (one,) = weigh_jitter(p, fits, priors, rows)
-        elif kind == "static":
-            (one,) = weigh_static(self.stepper, fits, priors, rows)
         else:
             (one,) = weigh_positional(p, fits, priors, rows, moving=kind == "kinematic")
         owed = self._owed_beside(estimate.combination)
