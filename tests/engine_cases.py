@@ -74,6 +74,19 @@ def solved(rates: Callable, start: Sequence[float], times: np.ndarray, tolerance
     return found.y.T
 
 
+def autocovariance(lag, frequency, damping):
+    """Of x'' + 2 z w x' + w^2 x = white noise, at unit variance: the textbook's free decay from rest."""
+    lag, rate = np.abs(lag), damping * frequency
+    if damping == 1:
+        return np.exp(-rate * lag) * (1 + rate * lag)
+    if damping < 1:
+        turn = frequency * np.sqrt(1 - damping**2)
+        return np.exp(-rate * lag) * (np.cos(turn * lag) + rate / turn * np.sin(turn * lag))
+    split = frequency * np.sqrt(damping**2 - 1)
+    slow, fast = rate - split, rate + split
+    return (fast * np.exp(-slow * lag) - slow * np.exp(-fast * lag)) / (fast - slow)
+
+
 def attracted(mu: float) -> Callable[[float, np.ndarray], list[float]]:
     """The rates of (x, y, px, py) of a unit mass in the potential -mu/r."""
 

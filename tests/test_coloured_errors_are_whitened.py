@@ -2,24 +2,12 @@
 
 import numpy as np
 import pytest
+from engine_cases import autocovariance
 from scipy.linalg import solve_triangular
 
 from symplearn.diagnosis._coloured import Colour, fit_colour, whitened_gram, whitened_residuals, whitened_series
 
 NUMBER = 40
-
-
-def autocovariance(lag, frequency, damping):
-    """Of x'' + 2 z w x' + w^2 x = white noise, at unit variance: the textbook's free decay from rest."""
-    lag, rate = np.abs(lag), damping * frequency
-    if damping == 1:
-        return np.exp(-rate * lag) * (1 + rate * lag)
-    if damping < 1:
-        turn = frequency * np.sqrt(1 - damping**2)
-        return np.exp(-rate * lag) * (np.cos(turn * lag) + rate / turn * np.sin(turn * lag))
-    split = frequency * np.sqrt(damping**2 - 1)
-    slow, fast = rate - split, rate + split
-    return (fast * np.exp(-slow * lag) - slow * np.exp(-fast * lag)) / (fast - slow)
 
 
 def irregular_times(seed=0):

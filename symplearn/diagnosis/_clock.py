@@ -45,12 +45,16 @@ class _Lane:
     shapes: tuple[Shapes, ...] = ()  # by channel
 
     @classmethod
-    def of(cls, problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int], b: int) -> "_Lane":
-        """Without a curve."""
+    def every(cls, problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int]) -> "list[_Lane]":
+        """All that take a given noise as it is given, without a curve."""
         weight = weights(problem, rows)
-        errors = [x[b] for x in residuals(problem, fits.predictions, weight)]
-        pieces = [pieces_of(problem, fits, [x[:, j] for x in errors], weight, b, j) for j in range(problem.channels)]
-        return cls(problem, fits, priors, b, pieces, sum((w > 0).sum(0) for w in weight))
+        errors, number = residuals(problem, fits.predictions, weight), sum((w > 0).sum(0) for w in weight)
+        return [
+            cls(problem, fits, priors, b,
+                [pieces_of(problem, fits, [x[b, :, j] for x in errors], weight, b, j) for j in range(problem.channels)],
+                number)
+            for b in trusting(problem, fits)
+        ]  # fmt: skip
 
     @property
     def curves(self) -> int:
@@ -113,9 +117,8 @@ def weigh_clock(
     `colours` are those of the sensors alone, by lane and channel. None for a combination with a wrongly given noise.
     """
     out: list[Estimate] = []
-    for b in trusting(problem, fits):
-        lane = _Lane.of(problem, fits, priors, rows, b)
-        begins: list[Both] = [[(colour, replace(colour, ratio=0.0)) for colour in colours[b]]]
+    for lane in _Lane.every(problem, fits, priors, rows):
+        begins: list[Both] = [[(colour, replace(colour, ratio=0.0)) for colour in colours[lane.b]]]
         if out:  # the errors beside another law, too: each search may be caught in an optimum of its own
             best = max(out, key=lambda one: one.log_evidence)
             begins.append(list(zip(best.colours, best.clocks, strict=True)))
@@ -128,7 +131,7 @@ def weigh_clock(
 def weigh_known_clock(problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int], like: Estimate) -> Estimate:
     """The only lane beside the errors of sensor and clock that another estimate has, and beside a curve where that has
     one: of its sizes the likeliest, which is granted all of their weight."""
-    lane = _Lane.of(problem, fits, priors, rows, 0)
+    (lane,) = _Lane.every(problem, fits, priors, rows)
     lane = lane.bent() if like.bends else lane
     white = _White.beside(lane, list(zip(like.colours, like.clocks, strict=True)))
     tried = [_integrated(lane, white, size) for size in (_sizes(lane, like.noise) if like.bends else [like.noise])]

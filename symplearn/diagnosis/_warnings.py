@@ -83,7 +83,7 @@ def warnings(
         moved = abs(after.z[problem.head + j] - c.mean[j]) / c.sd[j]
         if moved > 3:
             out.append(f"{name} moved {moved:.1f} of its prior standard deviations to fit the recording")
-    if chosen is not None and chosen.best.kind != "white" and is_clear(found, chosen.best):
+    if chosen is not None and is_clear(found, chosen.best):
         when = _when(problem, recordings, chosen.best)
         out.append(f"a remainder without a name is left beside the findings: {_REMAINDERS[chosen.best.kind]}{when}")
     if chosen is not None:
