@@ -1,5 +1,6 @@
 """Errors of the clock are integrated out exactly, and while a phase wanders the amplitudes still tell laws apart."""
 
+import itertools
 from dataclasses import replace
 
 import engine_cases as cases
@@ -20,10 +21,11 @@ NOISE, TIMES = 0.002, np.linspace(0.0, 50.0, 400)
 BOTH = (Colour(40.0, 2.0, 1.001, 0.0), Colour(300.0, 0.5, 30.0, 0.0))
 
 
-def problem(readings):
+def problem(readings, spans=((0, 400),)):
     """A spring without losses, its stiffness calibrated."""
     more = "[parameters]\nk = { value = 1.0, sd = 0.1 }\n"
-    return cases.problem(cases.simulation("p**2/2 + k*q**2/2", more=more), [cases.recorded(TIMES, readings)], 0.05)
+    recordings = [cases.recorded(TIMES[a:b], readings[a:b]) for a, b in spans]
+    return cases.problem(cases.simulation("p**2/2 + k*q**2/2", more=more), recordings, 0.05)
 
 
 def test_sensor_and_clock_are_integrated_out_together():
@@ -59,17 +61,19 @@ def swing(delay, seed=2):
     return q + NOISE * np.random.default_rng(seed).normal(size=len(q))
 
 
-def weighed(delay):
-    """Drag, which is true, and a viscous damping, under noise alone, an error of the sensor, and one of its clock."""
-    q = swing(delay)
-    p = problem(q)
+def weighed(delay, cuts=(0, 400)):
+    """Drag, which is true, and a viscous damping, under noise alone, an error of the sensor, and one of its clock; the
+    rows from one cut to the next are a recording."""
+    q, spans = swing(delay), list(itertools.pairwise(cuts))
+    p = problem(q, spans)
     priors = replace(priors_without_effects(p), scales=np.full(p.equations.size, 0.3), precision=np.full(p.size, 1e-2))
     names = [p.candidate(m).effect.name for m in p.searched]
     laws = [(p.searched[names.index(name)],) for name in ("quadratic_drag", "viscous_damping")]
     begin = np.zeros((2, p.size))
-    begin[:, 0], begin[:, p.head], begin[:, p.slots] = q[0], 1.0, 0.01
-    begin[:, 1] = (q[1] - q[0]) / (TIMES[1] - TIMES[0])
-    rows = [len(TIMES)]
+    begin[:, p.head], begin[:, p.slots] = 1.0, 0.01
+    for k, (a, _) in enumerate(spans):
+        begin[:, p.local(k)[:2]] = q[a], (q[a + 1] - q[a]) / (TIMES[1] - TIMES[0])
+    rows = [b - a for a, b in spans]
     fits = calibrate(Stepper(p), begin, laws, priors, rows)
     assert fits.converged.all()
     coloured, found = weigh_coloured(p, fits, priors, rows), Found(p, priors)
@@ -95,6 +99,13 @@ def test_amplitudes_tell_laws_apart_beside_a_wandering_clock():
     lost = replace(found.of(laws[0], "coloured"), converged=False)
     found.estimates[laws[0]] = [lost if one.kind == "coloured" else one for one in found.estimates[laws[0]]]
     assert found.shown(laws[0], clock) is found.of(laws[0], "white")
+
+
+def test_recordings_of_unequal_length_have_a_clock_each():
+    """So they do where the rows are two recordings, a short one and a long one."""
+    found, laws = weighed(late(0), (0, 150, 400))
+    drag, viscous = (found.of(law, "clock").log_evidence for law in laws)
+    assert drag > found.of(laws[0], "coloured").log_evidence + 20 and drag > viscous + 10
 
 
 def test_a_clock_that_keeps_time_explains_nothing():

@@ -89,7 +89,7 @@ class _White:
     determinants that the whitening leaves."""
 
     both: Both
-    series: list[list[tuple[Float[np.ndarray, "row column"], float]]]
+    series: list[list[tuple[Float[np.ndarray, "_ column"], float]]]
 
     @classmethod
     def beside(cls, lane: _Lane, both: Both) -> "_White":
