@@ -6,11 +6,11 @@ import engine_cases as cases
 import numpy as np
 import pytest
 
-from symplearn.diagnosis._bend import Shapes
+from symplearn.diagnosis._bend import Form, Shapes
 from symplearn.diagnosis._calibrate import calibrate
 from symplearn.diagnosis._forecast import forecast
 from symplearn.diagnosis._outlook import Outlook
-from symplearn.diagnosis._positional import weigh_positional
+from symplearn.diagnosis._positional import _weighed, weigh_positional
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
 from symplearn.diagnosis._weighed import weigh_coloured, weigh_white
@@ -82,10 +82,37 @@ def test_what_is_read_the_later_the_farther_out_it_is_errs_by_a_plain_curve():
     p, fits, priors = fitted(0.05, read=shutter)
     white, place = (weigh(p, fits, priors, [len(TIMES)])[0] for weigh in (weigh_white, weigh_positional))
     found, (q, v) = kinematic(p, fits, priors), swing(TIMES)
-    assert found.bends[0].shapes.curve
+    assert found.bends[0].shapes.form is Form.CURVE
     assert found.log_evidence > max(white.log_evidence, place.log_evidence) + 20
     # The error's rms is 0.014, the noise 0.01. Seen: 0.0012.
     assert np.sqrt(np.mean((found.bends[0](q, TIMES) - 0.05 * q * v) ** 2)) < 0.2 * NOISE
+
+
+def played(gap):
+    """A linkage with play: a textbook's backlash, by which what is read stands still until the gap is passed."""
+
+    def read(q, v, size):
+        out = [q[0] - size * gap]
+        for x in q[1:]:
+            out.append(min(max(out[-1], x - size * gap), x + size * gap))
+        return np.array(out)
+
+    return read
+
+
+def test_a_linkage_with_play_is_off_by_which_way_it_goes():
+    """By more than the noise, one way and the other: tens of nats above white noise and above polynomials of speed, and
+    what is told of it is the error."""
+    fine = np.linspace(0.0, 50.0, 399 * 20 + 1)
+    errors = (played(1.5 * NOISE)(swing(fine)[0], None, 1.0) - swing(fine)[0])[::20]
+    p, fits, priors = fitted(1.0, read=lambda q, v, size: q + size * errors)
+    found, white = kinematic(p, fits, priors), weigh_white(p, fits, priors, [len(TIMES)])[0]
+    bends = _weighed(p, fits, 0, priors, [len(TIMES)], True, Form.BENDS)
+    assert found.bends[0].shapes.form is Form.PLAY
+    # Seen: 36 nats above polynomials, 60 above white noise; and 0.0025 of 0.0147 is left.
+    assert found.log_evidence > max(white.log_evidence, bends.log_evidence) + 20
+    left = found.bends[0](swing(TIMES)[0], TIMES) - errors
+    assert np.sqrt(np.mean(left**2)) < 0.5 * NOISE < NOISE < np.std(errors)
 
 
 def test_the_shapes_are_polynomials_of_place_and_of_speed():

@@ -9,7 +9,7 @@ from numpy.polynomial import Legendre
 from scipy.stats import norm, t
 
 from symplearn import _effects as effects
-from symplearn.diagnosis._bend import Shapes
+from symplearn.diagnosis._bend import Form, Shapes
 from symplearn.diagnosis._calibrate import calibrate
 from symplearn.diagnosis._clock import weigh_clock
 from symplearn.diagnosis._forecast import forecast
@@ -148,9 +148,9 @@ def test_a_scale_that_saturates_is_a_plain_curve(read, is_curve):
     p, fits, priors = fitted(0.0, read=read)
     rows = [p.rows[0].fitted]
     (told,) = weigh_positional(p, fits, priors, rows)
-    curve, bends = (_weighed(p, fits, 0, priors, rows, False, way).log_evidence for way in (True, False))
+    curve, bends = (_weighed(p, fits, 0, priors, rows, False, way).log_evidence for way in (Form.CURVE, Form.BENDS))
     assert told.log_evidence == pytest.approx(np.logaddexp(curve, bends) - np.log(2))
-    assert told.bends[0].shapes.curve == is_curve
+    assert (told.bends[0].shapes.form is Form.CURVE) == is_curve
     # Seen: 12.7 nats for the curve, and 156 for the bends.
     assert (curve - bends if is_curve else bends - curve) > 5
     x = np.linspace(-0.8, 0.8, 50)

@@ -8,6 +8,7 @@ import pytest
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
+from symplearn.diagnosis._bend import Form
 from symplearn.diagnosis._calibrate import Fits
 from symplearn.diagnosis._clock import weigh_clock
 from symplearn.diagnosis._settle import settle, settled
@@ -104,6 +105,16 @@ def test_what_a_clock_does_is_kept_as_it_was_found():
     far, near, apart = ends("clock", (FAR + 2 * NEAR) / 3)
     assert apart < 1.0  # seen: 0.54
     assert near.log_evidence - 5.0 < far.log_evidence < near.log_evidence + 0.1  # seen: 3.1 below
+
+
+@pytest.mark.parametrize("form", list(Form))
+def test_an_error_keeps_its_form(form):
+    """Steps are those of the error that promised them, whichever is likelier about a point on the way."""
+    weigher, one = weighed_about(NEAR, waved(0.03), "kinematic")
+    other = replace(one, bends=(replace(one.bends[0], shapes=replace(one.bends[0].shapes, form=form)),))
+    again = weigher.beside(other, one.z)
+    assert again.bends[0].shapes.form is form
+    assert again.log_evidence == pytest.approx(weigher.beside(one, one.z).log_evidence)  # that of all forms together
 
 
 def test_what_is_not_the_weighers_own_stays_as_it_is():

@@ -11,7 +11,7 @@ from test_a_clock_may_wander import TIMES as LATE
 from test_a_clock_may_wander import late, problem, swing
 from test_coloured_errors_are_whitened import autocovariance
 
-from symplearn.diagnosis._bend import Bend, Shapes
+from symplearn.diagnosis._bend import Bend, Form, Shapes
 from symplearn.diagnosis._calibrate import calibrate, weights
 from symplearn.diagnosis._coloured import Colour
 from symplearn.diagnosis._exchange import Regression
@@ -95,7 +95,7 @@ def test_products_of_whitened_columns_are_the_dense_gaussian_process(kind, fitte
                         clocks=(CLOCK,))  # fmt: skip
     if kind == "askew":
         shown, times = [x.readings[0, :, 0] for x in fits.predictions], [r.times for r in p.rows]
-        shapes = Shapes.over(shown, times, np.concatenate(weight) > 0, moving=True, curve=True)
+        shapes = Shapes.over(shown, times, np.concatenate(weight) > 0, moving=True, form=Form.CURVE)
         estimate = replace(estimate, kind="clock", bends=(Bend(shapes, np.zeros(4), 0.0),))
     S, seen = covariances(kind, fits, weight, [r.times for r in p.rows])
     columns = np.random.default_rng(4).normal(size=(3, len(seen))) * seen

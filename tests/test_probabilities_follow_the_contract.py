@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from symplearn._effects import prices, vocabulary
+from symplearn.diagnosis._build import Restriction, augmented_equations, build
 from symplearn.diagnosis._calibrate import Priors
 from symplearn.diagnosis._document import told_apart
 from symplearn.diagnosis._found import Ahead, Found
+from symplearn.diagnosis._laws import laws, priced
 from symplearn.diagnosis._posterior import posterior
 from symplearn.diagnosis._weighed import Estimate
 
@@ -318,6 +320,29 @@ def test_how_wide_is_measured_in_each_effects_own_prior(problem):
     scales[problem.candidate(one).first] = 10.0
     fits.priors = replace(fits.priors, scales=scales)
     assert len(posterior(problem, fits, 1.0).named) == 1
+
+
+def test_what_has_moved_far_was_seen_however_narrow_its_prior(problem):
+    """Nearly as wide as its prior, an effect counts where its size is more than two standard deviations from nothing."""
+    one = place(problem, "viscous_damping", "q1")
+    for size, is_weighed in ((1.8, False), (2.0, True)):
+        fit = estimate(problem, (one,), 9.0, sd=0.95)
+        fit.z[problem.slots] = size
+        assert bool(posterior(problem, found(problem, estimate(problem, (), 0.0), fit), 1.0).named) == is_weighed
+
+
+def test_a_law_without_a_word_that_may_be_nothing_is_none():
+    """Though it is known well beside its prior, a law counts where it is more than two standard deviations from
+    nothing; a word does in any case."""
+    file = cases.simulation("(p1**2 + p2**2 + q1**2 + q2**2)/2", ["q1", "q2"], ["p1", "p2"], {"a": "q1"})
+    recording, every = cases.recorded(np.arange(10.0), np.ones((10, 1)), columns=("a",)), Restriction()
+    built = augmented_equations(file, 0.0, every, 0.0, priced(laws(file)))
+    p = build(file, built, [recording], 0.0, 1.0, every)
+    law, word = (len(p.equations.candidates) - 1,), (place(p, "viscous_damping", "q1"),)
+    for combination, size, is_weighed in ((law, 0.018, False), (law, 0.022, True), (word, 0.018, True)):
+        fit = estimate(p, combination, 9.0)
+        fit.z[p.slots] = size
+        assert bool(posterior(p, found(p, estimate(p, (), 0.0), fit), 1.0).named) == is_weighed
 
 
 @pytest.mark.parametrize("effect", ["periodic_forcing", "hidden_oscillator"])

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -10,31 +11,44 @@ from numpy.polynomial.legendre import legvander
 # Polynomials up to this degree, as a worn track has another error at every place; or a plain curve, as of a scale that
 # saturates: the square and the cube, as what is constant or in proportion has a name of its own.
 _DEGREE, _CURVE = 12, (2, 3)
+# Half of what a play may be, as shares of the range of what is read.
+_GAPS = (0.0025, 0.01, 0.04)
+
+
+class Form(Enum):
+    """What such an error looks like: many bends, a plain curve, or play, by which what is read lags behind on the way
+    there and on the way back."""
+
+    BENDS = "bends"
+    CURVE = "curve"
+    PLAY = "play"
 
 
 @dataclass(frozen=True)
 class Shapes:
-    """What such an error is a sum of: polynomials over the range of what is read, and with `speeds` over that of its
-    rate of change too; or a plain `curve` over the former."""
+    """What such an error is a sum of, over the range of what is read, and with `speeds` over that of its rate of change
+    too. Play goes with the direction, and is small beside the motion."""
 
     readings: tuple[float, float]
     speeds: tuple[float, float] | None = None
-    curve: bool = False
+    form: Form = Form.BENDS
 
     @classmethod
     def over(
         cls, expected: Sequence[Float[np.ndarray, " _"]], times: Sequence[Float[np.ndarray, " _"]],
-        seen: Bool[np.ndarray, " row"], moving: bool, curve: bool = False,
+        seen: Bool[np.ndarray, " row"], moving: bool, form: Form = Form.BENDS,
     ) -> "Shapes":  # fmt: skip
         """Those of what is read in some recordings, end to end, and with `moving` of its rates."""
         speeds = [rate(x, t) for x, t in zip(expected, times, strict=True)]
         ends = _ends(np.concatenate(expected), seen), _ends(np.concatenate(speeds), seen) if moving else None
-        return cls(*ends, curve)
+        return cls(*ends, form)
 
     def __call__(
         self, expected: Float[np.ndarray, "*batch row"], times: Float[np.ndarray, " row"]
     ) -> Float[np.ndarray, "*batch row shape"]:
-        if self.curve:
+        if self.form is Form.PLAY:
+            return _lags(expected, times, self.readings)
+        if self.form is Form.CURVE:
             plain = curves(expected, *self.readings)
             if self.speeds is None:
                 return plain
@@ -74,6 +88,25 @@ def curves(expected: Float[np.ndarray, "*row"], low: float, high: float) -> Floa
     """The square and the cube, counted from the middle of a range, of mean square one over it."""
     place = _place(expected, low, high)
     return np.stack([place**k * np.sqrt(2 * k + 1) for k in _CURVE], axis=-1)
+
+
+def _lags(
+    expected: Float[np.ndarray, "*batch row"], times: Float[np.ndarray, " row"], readings: tuple[float, float]
+) -> Float[np.ndarray, "*batch row gap"]:
+    """Where between both ends of its play what is read is, from -1 to 1, for several gaps: at the end that it comes
+    from, once it has come as far as the gap is wide from where it turned."""
+    speeds = rate(expected, times)
+    ways, turned = np.sign(speeds), np.zeros(expected.shape, bool)
+    turned[..., 1:] = ways[..., 1:] != ways[..., :-1]
+    after = np.maximum.accumulate(np.where(turned, np.arange(len(times)), 0), axis=-1)
+    before = np.maximum(after - 1, 0)
+    (x, u), (y, v) = ([np.take_along_axis(one, k, axis=-1) for one in (expected, speeds)] for k in (before, after))
+    # It turned between two rows; there its speed is nearly a straight line.
+    share = np.clip(u / np.where(u == v, 1.0, u - v), 0.0, 1.0)
+    ends = 0.5 * (x + y) + 0.25 * (u * share - v * (1.0 - share)) * (times[after] - times[before])
+    gaps = np.array(_GAPS) * max(readings[1] - readings[0], 1e-300)
+    come = np.where((after > 0)[..., None], np.abs(expected - ends)[..., None] / gaps, 2.0)
+    return -ways[..., None] * np.clip(come - 1.0, -1.0, 1.0)
 
 
 def _joint(

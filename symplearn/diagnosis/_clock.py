@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy.special import logsumexp
 
 from ._bearers import largest
-from ._bend import Bend, Shapes
+from ._bend import Bend, Form, Shapes
 from ._calibrate import Fits, Priors, residuals, weights
 from ._clock_errors import Piece, cleared, fitted, pieces_of
 from ._coloured import Colour
@@ -75,7 +75,7 @@ class _Lane:
         for j, own in enumerate(self.pieces):
             shown, times = [p.readings[self.b, :, j] for p in expected], [one.times for one in own]
             seen = np.concatenate([one.weight > 0 for one in own])
-            shape = Shapes.over(shown, times, seen, moving=True, curve=True)
+            shape = Shapes.over(shown, times, seen, moving=True, form=Form.CURVE)
             curves = [np.where(one.weight > 0, shape(x, one.times).T, 0.0) for one, x in zip(own, shown, strict=True)]
             pieces.append([replace(one, columns=np.concatenate([one.columns, curve]))
                            for one, curve in zip(own, curves, strict=True)])  # fmt: skip

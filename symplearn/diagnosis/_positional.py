@@ -5,7 +5,7 @@ random function of the reading: Legendre polynomials with independent coefficien
 proportion and are integrated out. A bias or a gain alone has a name of its own, and fewer unknowns to pay for.
 
 What a camera sees or a gear with play turns is off by another amount on the way back: such an error goes with the
-reading's rate of change as well (the kind `kinematic`), by polynomials of that.
+reading's rate of change as well (the kind `kinematic`), by polynomials of that, or with its direction alone.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,13 +16,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ._bearers import Left, Sizes, borne, largest, log_likelihood, sizes
-from ._bend import Bend, Shapes
+from ._bend import Bend, Form, Shapes
 from ._calibrate import Fits, Priors, residuals, weights
 from ._evidence import variance_inflation
 from ._problem import Problem
 from ._scatter import factor_evidence, law_gain
 from ._weighed import Estimate, amplitudes_out, correlated
 
+# Forms of an error that goes with what is read alone, and of one that goes with how that changes.
+_FORMS = ((Form.CURVE, Form.BENDS), (Form.CURVE, Form.BENDS, Form.PLAY))
 # Variances of the error against the noise's that are tried.
 _RATIOS = np.geomspace(0.03, 1e4, 12)
 
@@ -93,29 +95,31 @@ class _Channel:
 
 @np.errstate(all="ignore")  # a lane that diverged is told by its evidence
 def weigh_positional(
-    problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int], moving: bool = False
+    problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int], moving: bool = False, form: Form | None = None
 ) -> list[Estimate]:
     """Estimates where each channel's error goes with what it reads, about the trajectory fit: by a plain curve or by
-    one of many bends, each as likely as the other; with `moving` with how fast that changes, too, by many bends.
+    one of many bends, each as likely as the other; with `moving` with how fast that changes, too, or which way. What is
+    told of it is the likeliest form, or `form`.
 
     Of a combination with a wrongly given noise, too: no such error is as rough as noise.
     """
     out = []
     for b in range(len(fits.combinations)):
-        ways = [_weighed(problem, fits, b, priors, rows, moving, curve) for curve in (True, False)]
+        ways = [_weighed(problem, fits, b, priors, rows, moving, each) for each in _FORMS[moving]]
         values = np.nan_to_num([one.log_evidence for one in ways], nan=-np.inf, neginf=-np.inf)
         value = float(np.logaddexp.reduce(values)) - float(np.log(len(ways)))
-        out.append(replace(ways[int(values.argmax())], log_evidence=value))
+        told = int(values.argmax()) if form is None else _FORMS[moving].index(form)
+        out.append(replace(ways[told], log_evidence=value))
     return out
 
 
 def _weighed(
-    problem: Problem, fits: Fits, b: int, priors: Priors, rows: Sequence[int], moving: bool, curve: bool
+    problem: Problem, fits: Fits, b: int, priors: Priors, rows: Sequence[int], moving: bool, form: Form
 ) -> Estimate:
-    """The same by a plain `curve`, or by one of many bends."""
+    """The same by an error of one form."""
     combination, active = fits.combinations[b], problem.active(fits.combinations[b])
     known, precision = problem.noise_of(combination), priors.precision_of(problem, combination)
-    channels = [_channel(problem, fits, b, rows, j, moving, curve) for j in range(problem.channels)]
+    channels = [_channel(problem, fits, b, rows, j, moving, form) for j in range(problem.channels)]
     held = [np.where(active, precision * noise**2, np.inf) for noise in fits.noise[b]]
     each = zip(channels, known, held, strict=True)
     ratios, occam = borne([_sizes(problem, one, j, sd, free) for j, (one, sd, free) in enumerate(each)])
@@ -127,11 +131,11 @@ def _weighed(
     return replace(told, kind="kinematic" if moving else "positional")
 
 
-def _channel(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int, moving: bool, curve: bool) -> _Channel:
+def _channel(problem: Problem, fits: Fits, b: int, rows: Sequence[int], j: int, moving: bool, form: Form) -> _Channel:
     weight = weights(problem, rows)
     expected, times = [p.readings[b, :, j] for p in fits.predictions], _times(problem, weight)
     seen, parts = np.concatenate([w[:, j] > 0 for w in weight]), []
-    shapes = Shapes.over(expected, times, seen, moving, curve)
+    shapes = Shapes.over(expected, times, seen, moving, form)
     for r, (x, w) in enumerate(zip(residuals(problem, fits.predictions, weight), weight, strict=True)):
         slopes = np.zeros((problem.size, len(w)))
         slopes[problem.local(r)] = fits.predictions[r].slopes[b, :, :, j]
@@ -150,12 +154,12 @@ def _times(problem: Problem, weight: Sequence[np.ndarray]) -> list[Float[np.ndar
 def whitened_along(
     columns: Sequence[Float[np.ndarray, "column _"]], shown: Sequence[Float[np.ndarray, " _"]],
     times: Sequence[Float[np.ndarray, " _"]], weight: Sequence[Float[np.ndarray, " _"]], ratio: float, moving: bool,
-    curve: bool,
+    form: Form,
 ) -> list[Float[np.ndarray, "column _"]]:  # fmt: skip
     """One channel's columns, by recording, whitened beside an error that goes with what is read: the noise's variance
     and that of `ratio` times its size together. `shown` are the expected readings."""
     w = np.concatenate(weight)
-    shapes = Shapes.over(shown, times, w > 0, moving, curve)
+    shapes = Shapes.over(shown, times, w > 0, moving, form)
     roots = [np.sqrt(one) for one in weight]
     whole = [shapes(x, t).T * root for x, t, root in zip(shown, times, roots, strict=True)]
     return cleared_of([x * root for x, root in zip(columns, roots, strict=True)], whole, ratio)

@@ -16,6 +16,8 @@ from ._weighed import Estimate
 
 # A coefficient whose posterior is as wide as this share of its prior has learnt nothing from the recording.
 _UNINFORMED = 0.7
+# One that has moved so many standard deviations has, however narrow its prior was; a law that may be nothing is none.
+_MOVED = 2.0
 # A sensor that shows less than this share of the motion shows none of it, and its scale is no finding.
 _DEAD = 0.1
 # The simulation counts as consistent unless the probability of nothing left out is below this (contract).
@@ -180,7 +182,9 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
     An effect that calibration owns already (a stiffness beside a free stiffness) changes nothing, and its
     posterior is its prior; weighing it would only dilute the others. One that would swing, but fits best where it has
     not come round once, at the lowest frequency looked for or below, was not seen to swing: any slow change would do.
-    A scale that makes a reading vanish says nothing of the motion that was to be read.
+    A scale that makes a reading vanish says nothing of the motion that was to be read. A law without a word whose size
+    may be nothing has its evidence from no optimum: where it goes with a coordinate that is not read, it is as large as
+    that coordinate is small.
     """
     best = max(found.estimates[combination], key=lambda e: e.log_evidence)
     sd = np.sqrt(np.diag(best.covariance))
@@ -189,7 +193,9 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
         one = problem.candidate(member)
         amplitudes = slice(place.start, place.start + one.effect.amplitudes)
         scales = found.priors.scales[one.first : one.first + one.effect.amplitudes]
-        shown = bool((sd[amplitudes] < _UNINFORMED * scales).all())
+        moved = _moved(best, amplitudes)
+        shown = moved or bool((sd[amplitudes] < _UNINFORMED * scales).all())
+        known &= moved or one.nameless is None
         if one.effect is HIDDEN:  # how it swings may be seen where how strongly it is joined is not
             starts = np.stack([problem.unseen(r) for r in problem.members[member].recordings])
             shown |= bool((sd[starts] < _UNINFORMED * found.priors.unseen).any())
@@ -197,3 +203,9 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
         if one.effect is HIDDEN or isinstance(one.effect, Oscillating):
             known &= bool(best.z[place.stop - 1] > found.priors.lower[one.values.stop - 1])
     return bool(np.isfinite(best.log_evidence) and known)
+
+
+def _moved(best: Estimate, amplitudes: slice) -> bool:
+    """Whether amplitudes are clearly not zero, all together."""
+    z, spread = best.z[amplitudes], best.covariance[amplitudes, amplitudes]
+    return bool(z @ np.linalg.pinv(spread) @ z > _MOVED**2)

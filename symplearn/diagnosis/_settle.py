@@ -46,8 +46,23 @@ def settle(weigher: Weigher, is_mine: Callable[[Combination], bool]) -> None:
 
 
 def settled(weigher: Weigher, old: Estimate) -> Estimate | None:
-    """An estimate about the best point that steps lead to, with the evidence there; where they come to no end, with
-    what a further one promises, and no more than before. None where the evidence is no number at any point."""
+    """An estimate about its own optimum; where another form of the same error is likelier there, that one's. None where
+    the evidence is no number at any point."""
+    best = _followed(weigher, old)
+    while best is not None and best.converged and best.bends and best.kind != "clock":
+        other = weigher.beside(replace(best, bends=()), best.z)
+        if other.bends[0].shapes.form is best.bends[0].shapes.form:
+            break
+        new = _followed(weigher, other)
+        if new is None or not new.log_evidence > best.log_evidence:
+            break
+        best = new
+    return best
+
+
+def _followed(weigher: Weigher, old: Estimate) -> Estimate | None:
+    """An estimate about the best point that steps lead to, with the evidence there; where they come to no end, with a
+    nat of what a further one promises, and no more than before. None where the evidence is no number at any point."""
     origin, share, owed = _allowed(weigher, old), 1.0, 0.0
     best = weigher.beside(old, origin)
     white = weigher.found.of(old.combination, "white")
@@ -72,7 +87,8 @@ def settled(weigher: Weigher, old: Estimate) -> Estimate | None:
     value = best.log_evidence + owed
     if best.promised < _SETTLED:
         return replace(best, log_evidence=value)
-    return replace(best, z=origin, log_evidence=min(value + best.promised, old.log_evidence), converged=False)
+    hoped = min(value + min(best.promised, _FORESEEN), old.log_evidence)
+    return replace(best, z=origin, log_evidence=hoped, converged=False)
 
 
 def _allowed(weigher: Weigher, estimate: Estimate) -> Float[np.ndarray, " z"]:

@@ -178,8 +178,8 @@ class Weigher:
             self._add_beside_white(one)
 
     def beside(self, estimate: Estimate, z: Float[np.ndarray, " z"]) -> Estimate:
-        """One beside the remainder of another, which is one of the readings alone, about `z`; its evidence is without
-        what the step from there promises."""
+        """One beside the remainder of another, which is one of the readings alone and keeps its form, about `z`; its
+        evidence is without what the step from there promises."""
         p, own, rows = self.problem, [estimate.combination], self.rows
         predictions = self.stepper.predict(z[None], own, rows)
         fits = Fits(own, z[None], estimate.noise[None], predictions, np.zeros(1), np.zeros(1, bool))
@@ -191,7 +191,8 @@ class Weigher:
         elif kind == "jitter":
             (one,) = weigh_jitter(p, fits, priors, rows)
         else:
-            (one,) = weigh_positional(p, fits, priors, rows, moving=kind == "kinematic")
+            form = estimate.bends[0].shapes.form if estimate.bends else None
+            (one,) = weigh_positional(p, fits, priors, rows, kind == "kinematic", form)
         owed = self._owed_beside(estimate.combination)
         return replace(one, log_evidence=one.log_evidence + owed, outliers=estimate.outliers, converged=True)
 

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ._bend import Form
 from ._calibrate import Fits, weights
 from ._clock_errors import whitened_beside
 from ._coloured import whitened_series
@@ -48,8 +49,8 @@ def _channel(
         return [whitened_series(x, w, t, estimate.colours[j]).T for x, w, t in zip(columns, own, times, strict=True)]
     if estimate.kind == "clock":
         return _beside_a_clock(estimate, j, columns, shown, own, times)
-    curve = bool(estimate.bends) and estimate.bends[j].shapes.curve
-    return whitened_along(columns, shown, times, own, estimate.bent[j], estimate.kind == "kinematic", curve)
+    form = estimate.bends[j].shapes.form if estimate.bends else Form.BENDS
+    return whitened_along(columns, shown, times, own, estimate.bent[j], estimate.kind == "kinematic", form)
 
 
 def _beside_a_clock(
