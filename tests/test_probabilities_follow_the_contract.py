@@ -323,7 +323,7 @@ def test_how_wide_is_measured_in_each_effects_own_prior(problem):
 
 
 def test_what_has_moved_far_was_seen_however_narrow_its_prior(problem):
-    """Nearly as wide as its prior, an effect counts where its size is more than two standard deviations from nothing."""
+    """Nearly as wide as its prior, an effect counts where it is more than two standard deviations from nothing."""
     one = place(problem, "viscous_damping", "q1")
     for size, is_weighed in ((1.8, False), (2.0, True)):
         fit = estimate(problem, (one,), 9.0, sd=0.95)
