@@ -88,23 +88,19 @@ def test_what_is_read_the_later_the_farther_out_it_is_errs_by_a_plain_curve():
     assert np.sqrt(np.mean((found.bends[0](q, TIMES) - 0.05 * q * v) ** 2)) < 0.2 * NOISE
 
 
-def played(gap):
-    """A linkage with play: a textbook's backlash, by which what is read stands still until the gap is passed."""
-
-    def read(q, v, size):
-        out = [q[0] - size * gap]
-        for x in q[1:]:
-            out.append(min(max(out[-1], x - size * gap), x + size * gap))
-        return np.array(out)
-
-    return read
+def linked(q, half):
+    """What is read through a linkage with play, by the textbook's rule: it stands still until the gap is passed."""
+    out = [q[0] - half]
+    for x in q[1:]:
+        out.append(min(max(out[-1], x - half), x + half))
+    return np.array(out)
 
 
 def test_a_linkage_with_play_is_off_by_which_way_it_goes():
     """By more than the noise, one way and the other: tens of nats above white noise and above polynomials of speed, and
     what is told of it is the error."""
-    fine = np.linspace(0.0, 50.0, 399 * 20 + 1)
-    errors = (played(1.5 * NOISE)(swing(fine)[0], None, 1.0) - swing(fine)[0])[::20]
+    q = swing(np.linspace(0.0, 50.0, 399 * 20 + 1))[0]
+    errors = (linked(q, 1.5 * NOISE) - q)[::20]
     p, fits, priors = fitted(1.0, read=lambda q, v, size: q + size * errors)
     found, white = kinematic(p, fits, priors), weigh_white(p, fits, priors, [len(TIMES)])[0]
     bends = _weighed(p, fits, 0, priors, [len(TIMES)], True, Form.BENDS)

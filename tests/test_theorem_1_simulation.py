@@ -107,9 +107,10 @@ def test_a_linear_model_is_exact():
     expected = -multivariate_normal(cov=system[4]).logpdf(linear_residuals(*case)).sum()
     series = TimeSeries(jnp.asarray(TIMES), jnp.asarray(ys), jnp.asarray(us))
     model = linear_model(*system)
-    # Twenty-six squared residuals, 56 on average, and their sum, 1457, each to a few units of round-off, which is
-    # 2.3e-13 of the sum. Seen: up to 1.4e-12 on one machine, less than 1e-12 on those before it.
-    assert float(SIMULATION(model, series)) == pytest.approx(expected, abs=5e-12)
+    # Twenty-six squared residuals, each to round-off of a few units.
+    assert float(SIMULATION(model, series)) == pytest.approx(expected, abs=1e-12)
+    # The filter whitens each by a factor of its own covariance and adds them one by one, to 1457, of which a unit of
+    # round-off is 2.3e-13: 1.4e-12 was seen on one machine, so twenty units.
     assert float(FILTER(model, series)) == pytest.approx(expected, abs=5e-12)
 
 

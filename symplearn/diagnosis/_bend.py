@@ -106,7 +106,7 @@ def _lags(
     ends = 0.5 * (x + y) + 0.25 * (u * share - v * (1.0 - share)) * (times[after] - times[before])
     gaps = np.array(_GAPS) * max(readings[1] - readings[0], 1e-300)
     come = np.where((after > 0)[..., None], np.abs(expected - ends)[..., None] / gaps, 2.0)
-    return -ways[..., None] * np.clip(come - 1.0, -1.0, 1.0)
+    return np.nan_to_num(-ways[..., None] * np.clip(come - 1.0, -1.0, 1.0))
 
 
 def _joint(

@@ -5,7 +5,7 @@ random function of the reading: Legendre polynomials with independent coefficien
 proportion and are integrated out. A bias or a gain alone has a name of its own, and fewer unknowns to pay for.
 
 What a camera sees or a gear with play turns is off by another amount on the way back: such an error goes with the
-reading's rate of change as well (the kind `kinematic`), by polynomials of that, or with its direction alone.
+reading's rate of change as well (the kind `kinematic`), by polynomials of that, or as play.
 """
 
 from collections.abc import Callable, Sequence
@@ -98,8 +98,8 @@ def weigh_positional(
     problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int], moving: bool = False, form: Form | None = None
 ) -> list[Estimate]:
     """Estimates where each channel's error goes with what it reads, about the trajectory fit: by a plain curve or by
-    one of many bends, each as likely as the other; with `moving` with how fast that changes, too, or which way. What is
-    told of it is the likeliest form, or `form`.
+    one of many bends, each as likely as the other; with `moving` with how fast that changes, too, or as play. What is
+    told is the likeliest form, or `form`; the evidence is that of all.
 
     Of a combination with a wrongly given noise, too: no such error is as rough as noise.
     """
