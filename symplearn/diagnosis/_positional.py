@@ -52,11 +52,8 @@ class _Channel:
 
     def marginal(self, ratio: float) -> tuple[np.ndarray, float]:
         """Gram matrix of the plain columns with the shapes integrated out, and the log determinant they leave."""
-        return self._marginal(self.gram, self.plain, ratio)
-
-    def _marginal(self, gram: Float[np.ndarray, "column column"], plain: int, ratio: float) -> tuple[np.ndarray, float]:
-        unit = np.where(np.arange(len(gram)) < plain, 1.0, np.sqrt(ratio / (len(gram) - plain)))
-        gram, _, log = amplitudes_out(gram * np.outer(unit, unit), plain)
+        unit = np.where(np.arange(len(self.gram)) < self.plain, 1.0, np.sqrt(ratio / (len(self.gram) - self.plain)))
+        gram, _, log = amplitudes_out(self.gram * np.outer(unit, unit), self.plain)
         return gram, log - self.log_weights
 
     def left(self, precision: Float[np.ndarray, " plain"]) -> Callable[[float], tuple[float, float]]:
@@ -68,12 +65,15 @@ class _Channel:
         # In the unknowns' own units; one that does nothing, of no precision, makes up for nothing.
         size = np.sqrt(np.where(np.diagonal(held) > 0, np.diagonal(held), 1.0))
         gram, cross = self.gram[np.ix_(rest, rest)], self.gram[np.ix_(free, rest)] / size[:, None]
-        if np.isfinite(self.gram).all():  # of a trajectory that has not run away
-            gram = gram - cross.T @ np.linalg.lstsq(held / np.outer(size, size), cross)[0]
+        if not np.isfinite(self.gram).all():  # a trajectory that ran away
+            return lambda ratio: (np.nan, 0.0)
+        gram = gram - cross.T @ np.linalg.lstsq(held / np.outer(size, size), cross)[0]
+        rates, ways = np.linalg.eigh(gram[1:, 1:])  # once for every ratio
+        rates, along = np.maximum(rates, 0.0) / len(rates), (ways.T @ gram[1:, 0]) ** 2 / len(rates)
 
         def value(ratio: float) -> tuple[float, float]:
-            found, log = self._marginal(gram, 1, ratio)
-            return float(found[0, 0]), log
+            square = gram[0, 0] - (ratio * along / (1.0 + ratio * rates)).sum()
+            return float(square), float(np.log1p(ratio * rates).sum()) - self.log_weights
 
         return value
 

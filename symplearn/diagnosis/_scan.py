@@ -13,16 +13,19 @@ from jaxtyping import Float
 
 from .. import _effects as effects
 from .._effects import Candidate, Oscillating
+from ._arrow import MANY
 from ._calibrate import Fits, Priors, residuals, weights
 from ._noisy import PathFit, lane_grams
 from ._problem import SLOTS, Combination, Problem
-from ._score import Nuisance, Response, Score, Start, Unit, nuisance, placed, response, scores
+from ._score import Nuisance, Response, Score, Start, Unit, nuisance, placed, response, scores, unseen_nuisance
 from ._trajectory import DIRECTIONS, LANES, Stepper
 
 # Places tried for times, and the most frequencies; frequencies this many times pi over the span apart.
 _TIMES, _FREQUENCIES, _SPACING = 60, 160, 0.8
 # How far inside the motion a stop is tried, as shares of the way from its edge to its middle.
 _DEPTHS = np.geomspace(0.01, 0.9, 12)
+# Unseen oscillators that are scored at once.
+_TOGETHER = 64
 # Starts kept for each effect and target, and for each choice of recordings.
 BEST = 3
 
@@ -175,29 +178,45 @@ def scan(
 
     Places of the candidates that are `chosen` are the best already, and no neighbours of each other.
     """
-    lanes = list(packed(problem, units))
-    nuisances: dict[int, Nuisance] = {}
-    tried: list[Response] = []
-    # Scores with unknowns of their own are taken at once, by their place among all: of many recordings those unknowns
-    # are matrices of megabytes.
-    own: dict[int, Score | None] = {}
+    lanes, tried, others = list(packed(problem, units)), list[Response](), None
+    # Scores with unknowns of their own are taken a few at a time, by their place among all: of many recordings those
+    # unknowns are matrices of megabytes.
+    own, waiting = dict[int, Score | None](), dict[int, dict[int, Sequence[np.ndarray]]]()
+    together = 1 if len(problem.rows) >= MANY else _TOGETHER
     for group, by_unit in zip(lanes, grams(lanes), strict=True):
         for unit, by_recording in zip(group, by_unit, strict=True):
+            others = nuisance(problem, by_recording, z, combination, priors) if others is None else others
             for member in _members(problem, unit, combination):
-                others = nuisance(problem, by_recording, z, combination, priors, member, nuisances)
                 tried.append(response(problem, by_recording, unit, member))
-                if others is not nuisances[0]:
-                    (own[len(tried) - 1],) = scores(problem, tried[-1:], z, priors, others)
+                if problem.candidate(member).effect is effects.HIDDEN:
+                    some = waiting.setdefault(member, {})
+                    some[len(tried) - 1] = by_recording
+                    if len(some) == together:
+                        own |= _unseen_scores(problem, tried, waiting.pop(member), z, combination, priors, others)
+    if others is None:  # there is nothing to try
+        return []
+    for some in waiting.values():
+        own |= _unseen_scores(problem, tried, some, z, combination, priors, others)
     found: dict[int, list[Score]] = {}
-    for scored in _scored(problem, tried, own, z, priors, nuisances):
+    for scored in _scored(problem, tried, own, z, priors, others):
         found.setdefault(scored.member, []).append(scored)
     return [one.start(problem, z, combination)
             for member, listed in found.items() for one in _peaks(listed, problem.whole(member) in chosen)]  # fmt: skip
 
 
+def _unseen_scores(
+    problem: Problem, tried: Sequence[Response], some: dict[int, Sequence[np.ndarray]], z: Float[np.ndarray, " z"],
+    combination: Combination, priors: Priors, others: Nuisance,
+) -> dict[int, Score | None]:  # fmt: skip
+    """Scores of an unseen oscillator's units, by their place among the responses, from their Gram matrices."""
+    ones = [tried[k] for k in some]
+    alone = unseen_nuisance(problem, [*some.values()], z, combination, priors, ones[0].member, others)
+    return dict(zip(some, scores(problem, ones, z, priors, alone), strict=True))
+
+
 def _scored(
     problem: Problem, tried: Sequence[Response], own: dict[int, Score | None], z: Float[np.ndarray, " z"],
-    priors: Priors, nuisances: dict[int, Nuisance],
+    priors: Priors, others: Nuisance,
 ) -> list[Score]:  # fmt: skip
     """Scores in the order of the responses, like ones together; some are known."""
     alike: dict[tuple[int, bool], list[int]] = {}
@@ -207,7 +226,7 @@ def _scored(
             alike.setdefault((effect.amplitudes, effect.positive), []).append(k)
     found = dict(own)
     for some in alike.values():
-        found |= zip(some, scores(problem, [tried[k] for k in some], z, priors, nuisances[0]), strict=True)
+        found |= zip(some, scores(problem, [tried[k] for k in some], z, priors, others), strict=True)
     return [one for k in range(len(tried)) if (one := found[k]) is not None]
 
 

@@ -36,34 +36,37 @@ class Start:
 
 
 class Nuisance(NamedTuple):
-    """Everything but an effect's amplitudes, at its best without them."""
+    """Everything but an effect's amplitudes, at its best without them: one for many effects, or one for each."""
 
     active: Bool[np.ndarray, " z"]
-    inverse: Float[np.ndarray, "active active"]
-    vector: Float[np.ndarray, " active"]
-    step: Float[np.ndarray, " active"]  # to that best
+    inverse: Float[np.ndarray, "lane active active"]
+    vector: Float[np.ndarray, "lane active"]
+    step: Float[np.ndarray, "lane active"]  # to that best
     bounds: tuple[np.ndarray, np.ndarray]  # of every entry of z
-    spread: float  # the logarithm of the inverse's determinant
-    gain: float = 0.0  # of an unseen start, under the widest prior
+    spread: Float[np.ndarray, " lane"]  # the logarithm of the inverse's determinant
+    gain: Float[np.ndarray, " lane"]  # of an unseen start, under the widest prior
 
     @property
-    def earned(self) -> float:
+    def earned(self) -> Float[np.ndarray, " lane"]:
         """Log evidence of these unknowns, but for the density of their priors."""
-        return float(0.5 * self.vector @ self.step + 0.5 * self.spread)
+        return 0.5 * (self.vector * self.step).sum(1) + 0.5 * self.spread
 
 
 def nuisance(
-    problem: Problem, by_recording: Sequence[np.ndarray], z, combination: Combination, priors: Priors, member: int,
-    kept: dict[int, Nuisance],
+    problem: Problem, by_recording: Sequence[np.ndarray], z, combination: Combination, priors: Priors
+) -> Nuisance:
+    """The same for every effect but an unseen oscillator."""
+    return _remaining(problem, [by_recording], z, combination, priors)
+
+
+def unseen_nuisance(
+    problem: Problem, lanes: Sequence[Sequence[np.ndarray]], z, combination: Combination, priors: Priors, member: int,
+    others: Nuisance,
 ) -> Nuisance:  # fmt: skip
-    """The same for every effect, but for an unseen oscillator, whose start is unknown too."""
-    if not kept:
-        kept[0] = _remaining(problem, by_recording, z, combination, priors)
-    if problem.candidate(member).effect is not effects.HIDDEN:
-        return kept[0]
-    found = _remaining(problem, by_recording, z, combination, priors, member)
+    """That of an unseen oscillator's units, whose start is unknown too, beside that of every other effect."""
+    found = _remaining(problem, lanes, z, combination, priors, member)
     width = priors.precision_of(problem, (member,))[_starts(problem, member)]
-    return found._replace(gain=found.earned - kept[0].earned + float(0.5 * np.log(width).sum()))
+    return found._replace(gain=found.earned - others.earned + float(0.5 * np.log(width).sum()))
 
 
 def _starts(problem: Problem, member: int) -> np.ndarray:
@@ -72,7 +75,7 @@ def _starts(problem: Problem, member: int) -> np.ndarray:
 
 
 def _remaining(
-    problem: Problem, by_recording: Sequence[np.ndarray], z, combination: Combination, priors: Priors,
+    problem: Problem, lanes: Sequence[Sequence[np.ndarray]], z, combination: Combination, priors: Priors,
     unseen: int | None = None,
 ) -> Nuisance:  # fmt: skip
     """All unknowns of a combination, and the start of what one further member adds `unseen`."""
@@ -81,30 +84,33 @@ def _remaining(
         starts = _starts(problem, unseen)
         active[starts] = True
         precision[starts] = priors.precision_of(problem, (unseen,))[starts]
-    found, spread, push = _inverted(problem, by_recording, precision, active)
-    vector = push - precision * (z - priors.mean_of(problem, combination))
-    bounds = priors.bounds_of(problem, combination)
-    return Nuisance(active, found, vector[active], found @ vector[active], bounds, spread)
+    found, spread, push = _inverted(problem, lanes, precision, active)
+    vector = (push - precision * (z - priors.mean_of(problem, combination)))[:, active]
+    step = np.einsum("lab,lb->la", found, vector)
+    return Nuisance(active, found, vector, step, priors.bounds_of(problem, combination), spread, np.zeros(len(lanes)))
 
 
 def _inverted(
-    problem: Problem, by_recording: Sequence[np.ndarray], precision: Float[np.ndarray, " z"],
+    problem: Problem,
+    lanes: Sequence[Sequence[np.ndarray]],
+    precision: Float[np.ndarray, " z"],
     active: Bool[np.ndarray, " z"],
-) -> tuple[Float[np.ndarray, "active active"], float, Float[np.ndarray, " z"]]:  # fmt: skip
+) -> tuple[Float[np.ndarray, "lane active active"], Float[np.ndarray, " lane"], Float[np.ndarray, "lane z"]]:
     """The inverse of all information on what is active, the logarithm of its determinant, and what the error pushes."""
-    size, state, count = problem.size, problem.state, len(by_recording)
-    local = 1 + state + size - problem.head
-    if count >= MANY:
-        grams = np.stack([own[:local, :local] for own in by_recording])
-        push = np.concatenate([grams[:, 0, 1 : 1 + state].ravel(), grams[:, 0, 1 + state :].sum(0)])
-        found, spread = Arrow.of(grams[:, 1:, 1:], state).held(precision, active).inverse()
-        return found[np.ix_(active, active)], spread, push
-    gram = np.zeros((1 + size, 1 + size))
+    size, state, local = problem.size, problem.state, 1 + problem.state + problem.size - problem.head
+    by_recording = [np.stack([own[:local, :local] for own in each]) for each in zip(*lanes, strict=True)]
+    if len(by_recording) >= MANY:
+        grams = np.stack(by_recording, axis=1)
+        starts = grams[:, :, 0, 1 : 1 + state].reshape(len(lanes), -1)
+        push = np.concatenate([starts, grams[:, :, 0, 1 + state :].sum(1)], axis=1)
+        both = [Arrow.of(lane[:, 1:, 1:], state).held(precision, active).inverse() for lane in grams]
+        return np.stack([one[np.ix_(active, active)] for one, _ in both]), np.array([log for _, log in both]), push
+    gram = np.zeros((len(lanes), 1 + size, 1 + size))
     for r, own in enumerate(by_recording):
         place = np.concatenate([[0], 1 + problem.local(r)])
-        gram[np.ix_(place, place)] += own[:local, :local]
-    found = inverse(gram[1:, 1:][np.ix_(active, active)] + np.diag(precision[active]))
-    return found, float(np.linalg.slogdet(found)[1]), gram[0, 1:]
+        gram[:, place[:, None], place] += own
+    found = inverse(gram[:, 1:, 1:][:, active][:, :, active] + np.diag(precision[active]))
+    return found, np.linalg.slogdet(found)[1], gram[:, 0, 1:]
 
 
 def inverse(matrix: Float[np.ndarray, "*lane n n"]) -> Float[np.ndarray, "*lane n n"]:
@@ -161,8 +167,8 @@ class Score(NamedTuple):
 def scores(
     problem: Problem, responses: Sequence[Response], z: Float[np.ndarray, " z"], priors: Priors, others: Nuisance
 ) -> list[Score | None]:
-    """The score of every response, of effects that have as many amplitudes and the same signs; None where there is no
-    step."""
+    """The score of every response, of effects that have as many amplitudes and the same signs, or of one unseen
+    oscillator; None where there is no step."""
     ones = [problem.candidate(one.member) for one in responses]
     effect, number = ones[0].effect, ones[0].effect.amplitudes
     scales = np.stack([priors.scales[one.first : one.first + number] for one in ones])
@@ -172,7 +178,7 @@ def scores(
     # What the others can take over wholly leaves a difference of round-off, not less than nothing.
     held = scales**-2.0 + 1e-12 * np.diagonal(square, axis1=1, axis2=2)
     spread = inverse(square - cross.mT @ after + held[:, :, None] * np.eye(number))
-    push = vector - np.einsum("lza,z->la", after, others.vector)
+    push = vector - (after * others.vector[:, :, None]).sum(1)
     amplitudes = np.einsum("lab,lb->la", spread, push)
     sound = np.isfinite(amplitudes).all(1) & ~(effect.positive & (amplitudes[:, 0] < 0))
     lowest = np.full(number, -np.inf)
@@ -181,11 +187,8 @@ def scores(
     gains = others.gain + 0.5 * (push * amplitudes).sum(1) + 0.5 * np.linalg.slogdet(spread)[1] - np.log(scales).sum(1)
     steps = others.step - np.einsum("lza,la->lz", after, amplitudes)
     if effect is effects.HIDDEN:
-        members = np.array([one.member for one in responses])
-        for member in np.unique(members):
-            own = members == member
-            lanes = after[own], amplitudes[own], spread[own], steps[own]
-            gains[own] += _unseen_strengths(problem, int(member), priors, others, *lanes)
+        (member,) = {one.member for one in responses}
+        gains += _unseen_strengths(problem, member, priors, others, after, amplitudes, spread, steps)
     else:
         shape = scales[:, :, None] * scales[:, None, :]
         gains += mixture_gains(amplitudes / scales, spread / shape, np.zeros(number, int), lowest)
@@ -209,7 +212,7 @@ def _unseen_strengths(
     )
     follow = after[:, some]
     cross = -follow @ spread
-    corner = others.inverse[np.ix_(some, some)] + follow @ spread @ follow.mT
+    corner = others.inverse[:, some][:, :, some] + follow @ spread @ follow.mT
     joint = np.concatenate(
         [np.concatenate([spread, cross.mT], axis=2), np.concatenate([cross, corner], axis=2)], axis=1
     )

@@ -11,6 +11,7 @@ nothing at zero (the moment prior of Johnson and Rossell 2010): what is not need
 """
 
 import itertools
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -37,6 +38,8 @@ _WITHIN = 0.4
 _REACH, _POINTS = 5.0, 121
 # What the recording says of a direction is at least this share of what the prior says.
 _SILENT = 1e-9
+# Widths by the narrowest: evenly spread in their logarithm.
+_SHRINKING, _FAINT_ONES = np.linspace(1.0, 0.0, WIDTHS), np.geomspace(FAINT, 1.0, FAINT_WIDTHS)
 # Of a correlation matrix.
 _ROUND_OFF = 1e-13
 # Entries of one effect from which on matrices are not inverted: the starts of an unseen oscillator in many recordings.
@@ -139,9 +142,9 @@ def mixture_gains(
         return _gains(logs, squares, own, alone, sound)
     likelihood = (vectors * bare[:, None]) @ vectors.mT
     told = np.einsum("lij,lj->li", vectors, along / left)
-    parts = [np.linalg.eigvalsh(spread[:, own == k][:, :, own == k]) for k in range(effects)]
+    parts = [_eigenvalues(spread[:, own == k][:, :, own == k]) for k in range(effects)]
     shares = np.stack([_shares(part, alone) for part in parts], axis=1)
-    choices = np.array(list(itertools.product(range(shares.shape[-1]), repeat=effects)))
+    choices = _choices(shares.shape[-1], effects)
     widths = shares[:, np.arange(effects), choices][..., own]
     # The widest priors last, whose effects may be too weak to be seen.
     every = np.concatenate([widths, np.ones((len(centre), 1, a))], axis=1)
@@ -160,6 +163,15 @@ def _gains(
     return np.where(sound & np.isfinite(gains), gains, 0.0)
 
 
+@lru_cache
+def _choices(widths: int, effects: int) -> Int[np.ndarray, "choice effect"]:
+    return np.array(list(itertools.product(range(widths), repeat=effects)))
+
+
+def _eigenvalues(matrices: Float[np.ndarray, "lane b b"]) -> Float[np.ndarray, "lane b"]:
+    return matrices[:, 0] if matrices.shape[-1] == 1 else np.linalg.eigvalsh(matrices)
+
+
 def _shares(values: Float[np.ndarray, "lane b"], alone: bool) -> Float[np.ndarray, "lane width"]:
     """Widths of one effect's prior, in that of the widest, by the eigenvalues of what is known of it."""
     values = np.clip(values, 1e-300, None)
@@ -175,8 +187,8 @@ def faint_share(sd: float) -> float:
 def _widths(narrowest: Float[np.ndarray, "*lane"], alone: bool) -> Float[np.ndarray, "*lane width"]:
     """All of them the widest where nothing is seen of any."""
     if alone:
-        return np.broadcast_to(np.geomspace(FAINT, 1.0, FAINT_WIDTHS), (*np.shape(narrowest), FAINT_WIDTHS))
-    return np.geomspace(np.clip(narrowest, 1e-12, 1.0), 1.0, WIDTHS, axis=-1)
+        return np.broadcast_to(_FAINT_ONES, (*np.shape(narrowest), FAINT_WIDTHS))
+    return np.clip(narrowest, 1e-12, 1.0)[..., None] ** _SHRINKING
 
 
 def _diagonal(matrices: Float[np.ndarray, "*lane a a"]) -> Float[np.ndarray, "*lane a"]:
