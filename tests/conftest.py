@@ -1,4 +1,5 @@
-"""Double precision, a private folder where compiled programs outlive the run, and not too many of them at once."""
+"""Shapes and types checked at every call, double precision, a private folder where compiled programs outlive the run,
+and not too many of them at once."""
 
 import gc
 import os
@@ -6,8 +7,21 @@ from pathlib import Path
 
 import jax
 import pytest
+from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
+
+
+def _checked(package: str) -> list[str]:
+    """Modules of a package, but those that write machine code: a diagnosis calls them half a million times with hardly
+    an array, and checking that took a third of it."""
+    folder = Path(__file__).parents[1] / package
+    own = [path.stem for path in folder.glob("*.py") if not path.stem.startswith(("__", "_machine"))]
+    inner = [path.parent.name for path in folder.glob("*/__init__.py")]
+    return [f"{package}.{name}" for name in own + inner]
+
+
+install_import_hook([*_checked("symplearn"), *_checked("integrators")], "beartype.beartype")
 
 
 def _private_cache() -> Path | None:

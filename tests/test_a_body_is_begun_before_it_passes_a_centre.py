@@ -41,7 +41,9 @@ def passing(name):
     return cases.problem(file, [cases.recorded(times, readings)], times[1] / 4)
 
 
-@pytest.mark.parametrize("name", PASSING)
+@pytest.mark.parametrize(
+    "name", ["close", "rough", *(pytest.param(one, marks=pytest.mark.slow) for one in ("slow", "round"))]
+)
 def test_an_orbit_is_begun(name):
     """The best lane follows the first turn of an ellipse, and begins where it began, or at the mirror image on the
     other side of the x axis, which shows the same."""

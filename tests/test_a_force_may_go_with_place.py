@@ -133,6 +133,7 @@ def test_beside_a_finding_it_needs_no_name():
     assert "cubic_stiffness" in named
 
 
+@pytest.mark.slow
 def test_a_small_force_of_the_fifth_power_is_a_remainder_and_a_larger_one_a_finding():
     """Beside the drag that a hardening spring lacks, of stiffnesses known to some per cent, a force with q^5 that shows
     less than half the noise is no finding, however clear it is; twice as large it is told as what it is."""

@@ -173,9 +173,11 @@ def two_scales(e, off):
     """Log likelihood of a noise of two scales over a Gaussian's for the readings that are not suspected, by the share
     and the wider one's standard deviation."""
 
+    plain, likely = norm.logpdf(e), norm.logpdf(e[~off]).sum()
+
     def log_likelihood(share, size):
-        wide = np.log(share) + norm.logpdf(e, scale=np.hypot(size, 1.0))
-        return np.logaddexp(wide, np.log1p(-share) + norm.logpdf(e)).sum() - norm.logpdf(e[~off]).sum()
+        wide = np.log(share) - 0.5 * e**2 / (size**2 + 1) - 0.5 * np.log(2 * np.pi * (size**2 + 1))
+        return np.logaddexp(wide, np.log1p(-share) + plain).sum() - likely
 
     return log_likelihood
 

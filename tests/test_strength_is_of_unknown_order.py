@@ -164,7 +164,7 @@ def test_what_the_recording_cannot_show_gains_nothing():
 
 @pytest.mark.parametrize("told", [(0.05, 0.09), (0.0, 0.1), (0.1, 0.02)], ids=["drives", "only damps", "turns far out"])
 def test_a_self_excitation_turns_where_the_motion_is(told):
-    """Its c is of any order of magnitude, its ln a within ln 2 of the motion's: SciPy's quadrature over both."""
+    """Its c is of any order of magnitude, its ln a within ln 2 of the motion's: SciPy's densities over both."""
     scales, sd, correlation = np.array([0.3, 0.5]), np.array([0.02, 0.03]), 0.6
     likelihood = np.outer(sd, sd) * np.array([[1.0, correlation], [correlation, 1.0]])
     spread = np.linalg.inv(np.linalg.inv(likelihood) + np.diag(scales**-2.0))
@@ -173,15 +173,17 @@ def test_a_self_excitation_turns_where_the_motion_is(told):
     seen = stats.multivariate_normal(np.array(told), likelihood)
 
     def integral(prior, low, high):
-        density = lambda y, x: seen.pdf([x, np.exp(y)]) * prior(x, np.exp(y)) * np.exp(y)  # noqa: E731
-        return integrate.dblquad(density, 0.0, 0.3, low, high, epsabs=0, epsrel=1e-3)[0]
+        """Over c, and e in its logarithm, by midpoints. Seen: within 1e-5 nats of SciPy's dblquad."""
+        c, y = (a + (b - a) * (np.arange(1200) + 0.5) / 1200 for a, b in ((0.0, 0.3), (low, high)))
+        c, y = np.meshgrid(c, y)
+        return (high - low) * np.mean(seen.pdf(np.stack([c, np.exp(y)], axis=-1)) * prior(c, np.exp(y)) * np.exp(y))
 
     def independent(c, e):
         return 4 * stats.norm.pdf(c, scale=scales[0]) * stats.norm.pdf(e, scale=scales[1])
 
     def turning(c, e):
-        size = c / (widths * scales[0])
-        strength = 2 * np.mean(size**2 * stats.norm.pdf(c, scale=widths * scales[0]))
+        size = [c / (width * scales[0]) for width in widths]
+        strength = 2 * sum(one**2 * stats.norm.pdf(one) * one / c for one in size) / len(size)
         a, motion = np.sqrt(c / e), np.sqrt(scales[0] / scales[1])
         within = (a > 0.4 * motion) / stats.lognorm.sf(0.4, np.log(2))
         return strength * within * stats.lognorm.pdf(a, np.log(2), scale=motion) * a / (2 * e)
