@@ -38,6 +38,7 @@ def cubic_drag():
     return cases.simulation("p**2/2 + q**2/2"), runs, Options(restriction=Restriction(FRICTION), jobs=2)
 
 
+@pytest.mark.slow
 def test_a_drag_with_the_third_power_of_the_speed_is_no_quadratic_drag():
     """No drag of the vocabulary is named, and the force on q is the one that was."""
     told = diagnose(*cubic_drag())

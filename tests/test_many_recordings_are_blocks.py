@@ -83,20 +83,20 @@ def test_the_strength_of_many_starts_needs_no_inverse(alone, monkeypatch):
 
 
 def test_a_scan_of_many_recordings_is_that_of_the_whole(monkeypatch):
-    """What a scan of nine recordings inverts is the same in blocks and as a whole, where the start of an unseen
-    oscillator is not looked for; so is what the errors push."""
+    """What a scan of nine recordings inverts, for two effects at once, is the same in blocks and as a whole, where the
+    start of an unseen oscillator is not looked for; so is what the errors push."""
     times = np.linspace(0.0, 1.0, 5)
     rows = [cases.recorded(times, np.sin(times)) for _ in range(COUNT)]
     p = cases.problem(
         cases.simulation("p**2/2 + k*q**2/2", more="[parameters]\nk = { value = 1.0, sd = 0.1 }"), rows, 0.25
     )
     local = 1 + p.state + p.size - p.head
-    columns = np.random.default_rng(0).normal(size=(COUNT, 40, local + 2))
-    grams, active = list(columns.swapaxes(1, 2) @ columns), p.active(())
+    columns = np.random.default_rng(0).normal(size=(2, COUNT, 40, local + 2))
+    lanes, active = [list(lane) for lane in columns.swapaxes(2, 3) @ columns], p.active(())
     precision = np.random.default_rng(1).uniform(0.1, 10.0, p.size)
-    blocks = _score._inverted(p, grams, precision, active)
+    blocks = _score._inverted(p, lanes, precision, active)
     monkeypatch.setattr(_score, "MANY", COUNT + 1)
     # Round-off of two ways to invert a matrix whose columns are alike in size: 6e-17 was seen of its inverse, 1e-14 of
     # its determinant's logarithm; entries that are zero are so to 1e-12.
-    for one, other in zip(blocks, _score._inverted(p, grams, precision, active), strict=True):
+    for one, other in zip(blocks, _score._inverted(p, lanes, precision, active), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)

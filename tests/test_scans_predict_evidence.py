@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
+from symplearn.diagnosis import _scan
 from symplearn.diagnosis._calibrate import calibrate
 from symplearn.diagnosis._scan import grid, on_trajectory, scan
 from symplearn.diagnosis._score import Unit
@@ -256,3 +257,18 @@ def test_an_unseen_oscillator_that_moves_already_is_seen(stepper, priors, fits):
     assert p.members[start.combination[0]].recordings == (0, 1)
     # The substep's error.
     assert start.gain == pytest.approx(expected, abs=2e-3 * abs(expected)) and expected > 50
+
+
+def test_unseen_oscillators_are_scored_together_as_alone(stepper, priors, fits, monkeypatch):
+    """Of every frequency, in both recordings and in one, a few at a time: gains and starts are those of one by one."""
+    p, wide = stepper.problem, replace(priors, unseen=UNSEEN)
+    member = next(m for m in p.searched if p.candidate(m).effect.name == "hidden_oscillator")
+    grams, units = on_trajectory(stepper, fits, 0, ROWS), grid(p, wide, member)
+    found = []
+    for number in (5, 1):
+        monkeypatch.setattr(_scan, "_TOGETHER", number)
+        found.append(scan(p, grams, fits.z[0], (), wide, units))
+    assert len(units) > 5 and len({s.combination for s in found[0]}) == 3
+    for one, other in zip(*found, strict=True):
+        assert one.combination == other.combination and one.gain == pytest.approx(other.gain, rel=1e-9)
+        np.testing.assert_allclose(one.z, other.z, rtol=1e-9, atol=1e-12)  # round-off of an inverse
