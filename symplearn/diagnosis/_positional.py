@@ -79,17 +79,19 @@ class _Channel:
 
     def cleared(self, ratio: float) -> Float[np.ndarray, "column row"]:
         """The plain columns without what the shapes take of them."""
-        rest = self.columns[self.plain :]
-        held = rest @ rest.T + np.eye(len(rest)) * len(rest) / ratio
-        plain = self.columns[: self.plain]
-        return plain - (plain @ rest.T) @ np.linalg.solve(held, rest)
+        cross, held = self.gram[: self.plain, self.plain :], self._held(ratio)
+        return self.columns[: self.plain] - np.linalg.solve(held, cross.T).T @ self.columns[self.plain :]
+
+    def _held(self, ratio: float) -> Float[np.ndarray, "shape shape"]:
+        """What is known of the shapes' coefficients, in units of one reading."""
+        shapes = self.gram[self.plain :, self.plain :]
+        return shapes + np.eye(len(shapes)) * len(shapes) / ratio
 
     def bend(self, column: Float[np.ndarray, " column"], ratio: float, noise: float) -> Bend:
         """What is known of the error, given the plain columns' errors as a sum of them."""
-        rest = self.columns[self.plain :]
-        spread = np.linalg.inv(rest @ rest.T + np.eye(len(rest)) * len(rest) / ratio)
-        mean = spread @ (rest @ (column @ self.columns[: self.plain]))
-        square = float((rest * (spread @ rest)).sum()) / max(self.total, 1e-300)
+        spread = np.linalg.inv(self._held(ratio))
+        mean = spread @ (self.gram[self.plain :, : self.plain] @ column)
+        square = float((spread * self.gram[self.plain :, self.plain :]).sum()) / max(self.total, 1e-300)
         return Bend(self.shapes, mean, noise * float(np.sqrt(max(square, 0.0))))
 
 

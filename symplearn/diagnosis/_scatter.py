@@ -61,13 +61,13 @@ def _gaussian(e: np.ndarray, free: bool) -> np.ndarray:
 
 def _student(e: np.ndarray, free: bool) -> np.ndarray:
     """Log likelihood of Student's t, its scale the best one where it is free, else that of unit variance."""
-    f = _FREEDOM
+    f, squares = _FREEDOM, e**2
     square = np.full((*e.shape[:-1], 1), (f - 2) / f)
     for _ in range(30 if free else 0):
-        square = np.mean((f + 1) / (f + e**2 / square) * e**2, axis=-1, keepdims=True)
-        square = np.maximum(square, 1e-300)
+        share = (squares / (f * square + squares)).sum(-1, keepdims=True) / e.shape[-1]
+        square = np.maximum((f + 1) * square * share, 1e-300)
     constant = gammaln((f + 1) / 2) - gammaln(f / 2) - 0.5 * np.log(f * np.pi * square)
-    return np.asarray((constant - 0.5 * (f + 1) * np.log1p(e**2 / (f * square))).sum(-1))
+    return np.asarray((constant - 0.5 * (f + 1) * np.log1p(squares / (f * square))).sum(-1))
 
 
 def factor_evidence(
