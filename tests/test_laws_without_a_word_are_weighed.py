@@ -29,19 +29,16 @@ def value(text, **states):
     return float(sympy.sympify(text).subs(states))
 
 
-def cubic_drag():
-    """A simulation without a drag, and an oscillator with one that goes with v^3 from a start at 1 and one at 0.3."""
+@pytest.mark.slow
+def test_a_drag_with_the_third_power_of_the_speed_is_no_quadratic_drag():
+    """An oscillator with a drag that goes with v^3 from a start at 1 and one at 0.3: no drag of the vocabulary is
+    named, the force on q is the one that was, and the simulation with it has nothing left out."""
     times, runs = np.linspace(0.0, 30.0, 200), []
     for k, start in enumerate((1.0, 0.3)):
         q = cases.solved(lambda t, x: [x[1], -x[0] - 0.1 * x[1] ** 3], [start, 0.0], times)[:, 0]
         runs.append(cases.recorded(times, q + 0.01 * np.random.default_rng(k).normal(size=len(times))))
-    return cases.simulation("p**2/2 + q**2/2"), runs, Options(restriction=Restriction(FRICTION), jobs=2)
-
-
-@pytest.mark.slow
-def test_a_drag_with_the_third_power_of_the_speed_is_no_quadratic_drag():
-    """No drag of the vocabulary is named, and the force on q is the one that was."""
-    told = diagnose(*cubic_drag())
+    some = Options(restriction=Restriction(FRICTION), jobs=2)
+    told = diagnose(cases.simulation("p**2/2 + q**2/2"), runs, some)
     (finding,) = told.document["findings"]
     assert (finding["effect"], finding["target"], finding["family"]) == ("unnamed_force", "q", "any")
     assert told.document["family_probability"]["dissipation"] > 0.95 and "activity" not in found_likely(told)
@@ -52,13 +49,7 @@ def test_a_drag_with_the_third_power_of_the_speed_is_no_quadratic_drag():
     # What is lost in a swing of amplitude 1, 0.1 * 3/8, to five of the standard deviations that are told, 0.0096 of it
     # each. Seen: 0.03744.
     assert np.mean(power) == pytest.approx(-0.0375, rel=0.05)
-
-
-@pytest.mark.slow
-def test_nothing_is_left_out_of_the_simulation_that_has_the_drag():
-    """With the force that was found in it the simulation is consistent with the same recordings."""
-    file, runs, some = cubic_drag()
-    again = diagnose(diagnose(file, runs, some).augmented, runs, some)
+    again = diagnose(told.augmented, runs, some)
     assert again.document["verdict"] == "consistent"
 
 
