@@ -14,7 +14,7 @@ jax.config.update("jax_enable_x64", True)
 
 def _checked(package: str) -> list[str]:
     """Modules of a package, but those that write machine code: a diagnosis calls them half a million times with hardly
-    an array, and checking that took a third of it."""
+    an array, and checking that took a fifth of it."""
     folder = Path(__file__).parents[1] / package
     own = [path.stem for path in folder.glob("*.py") if not path.stem.startswith(("__", "_machine"))]
     inner = [path.parent.name for path in folder.glob("*/__init__.py")]

@@ -269,6 +269,8 @@ def test_unseen_oscillators_are_scored_together_as_alone(stepper, priors, fits, 
         monkeypatch.setattr(_scan, "_TOGETHER", number)
         found.append(scan(p, grams, fits.z[0], (), wide, units))
     assert len(units) > 5 and len({s.combination for s in found[0]}) == 3
+    # Issue 7 asks for 1e-10 of every fast path. Seen: 2e-16 of the gains, and 6e-16 of unknowns about one, of which
+    # those that are zero are so to round-off.
     for one, other in zip(*found, strict=True):
-        assert one.combination == other.combination and one.gain == pytest.approx(other.gain, rel=1e-9)
-        np.testing.assert_allclose(one.z, other.z, rtol=1e-9, atol=1e-12)  # round-off of an inverse
+        assert one.combination == other.combination and one.gain == pytest.approx(other.gain, rel=1e-10)
+        np.testing.assert_allclose(one.z, other.z, rtol=1e-10, atol=1e-14)
