@@ -56,12 +56,12 @@ def test_a_drag_of_another_power_is_a_rival():
 
 
 def test_a_rival_is_judged_in_a_dose_as_small_as_the_truth():
-    """Over fifty swings of a Duffing oscillator, a damping that takes under a hundredth of its energy in all has the
+    """Over 25 swings of a Duffing oscillator, a damping that takes under a hundredth of its energy in all has the
     response of its own word, of a quadratic drag and of dry friction: candidates are far stronger to begin with."""
     setup, public = setting("duffing")
     period = setup.system.period(setup.values)
-    setup = setup._replace(records=(setup.records[0]._replace(times=np.linspace(0.0, 50 * period, 400)),))
-    truth = Effect("viscous_damping", "q", {"c": float(2e-5 * setup.values["m"] * 2 * np.pi / period)})
+    setup = setup._replace(records=(setup.records[0]._replace(times=np.linspace(0.0, 25 * period, 200)),))
+    truth = Effect("viscous_damping", "q", {"c": float(4e-5 * setup.values["m"] * 2 * np.pi / period)})
     rivals = ranked(form_of(setup, public), public, (), truth, candidates(setup, public, ()))
     left = {r.effect.word: r.part for r in rivals}
     assert all(left[word] < 1e-3 for word in ("viscous_damping", "quadratic_drag", "coulomb_friction"))

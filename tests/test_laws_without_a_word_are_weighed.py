@@ -53,6 +53,7 @@ def test_a_drag_with_the_third_power_of_the_speed_is_no_quadratic_drag():
     assert again.document["verdict"] == "consistent"
 
 
+@pytest.mark.slow
 def test_an_energy_of_both_coordinates_is_one_force_on_each():
     """Two oscillators joined by the energy 0.5 x1^2 x2: one finding for each coordinate, with one probability, whose
     expressions are the slopes of that energy; both stand in the simulation that has them."""

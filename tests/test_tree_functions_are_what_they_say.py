@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import sympy
 
+from symplearn import _symbolic_slopes
 from symplearn._expression import parse_expression, symbol
 from symplearn._separable import is_separable
 from symplearn._symbolic import TooLarge, derivative, gradient, jax_function, numpy_function
@@ -49,19 +50,26 @@ def test_slopes_that_are_trees_are_those_of_the_function():
     np.testing.assert_array_equal(ours(POINT), plain(POINT))
     # The same products in another order; entries are about one, and those that cancel are left with their round-off.
     for mode in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(mode(ours)(POINT), mode(plain)(POINT), rtol=1e-13, atol=1e-14)  # a few roundings
+        both = (jax.jit(mode(function))(POINT) for function in (ours, plain))
+        np.testing.assert_allclose(*both, rtol=1e-13, atol=1e-14)  # a few roundings
     many = POINT[:, None] * jnp.array([1.0, 0.9])
-    np.testing.assert_allclose(jax.jvp(ours, (many,), (many,))[1], jax.jvp(plain, (many,), (many,))[1], rtol=1e-13)
-    twice = jax.jacfwd(jax.jacfwd(ours))(POINT), jax.jacfwd(jax.jacfwd(plain))(POINT)
+    along = (jax.jit(lambda x, f=function: jax.jvp(f, (x,), (x,))[1])(many) for function in (ours, plain))
+    np.testing.assert_allclose(*along, rtol=1e-13)
+    twice = (jax.jit(jax.jacfwd(jax.jacfwd(function)))(POINT) for function in (ours, plain))
     np.testing.assert_allclose(*twice, rtol=1e-12, atol=1e-13)  # a few more
     assert "custom_jvp_call" in str(jax.make_jaxpr(ours)(POINT))
 
 
-def test_large_trees_are_left_to_jax():
+def test_large_trees_are_left_to_jax(monkeypatch):
     """What SymPy would differentiate too long is differentiated by JAX, to the same slopes."""
-    large = sympy.Add(*(sympy.sin(k * SYMBOLS[0]) * sympy.cos(k * SYMBOLS[1]) for k in range(1, 3000)))
+    large = sympy.Add(*(sympy.sin(k * SYMBOLS[0]) * sympy.cos(k * SYMBOLS[1]) for k in range(1, 30)))
+    small = with_slopes([large], SYMBOLS)
+    monkeypatch.setattr(_symbolic_slopes, "_WORTH", 200)
     function = with_slopes([large], SYMBOLS)
+    assert "custom_jvp_call" in str(jax.make_jaxpr(small)(POINT))
     assert "custom_jvp_call" not in str(jax.make_jaxpr(function)(POINT))
+    # Sums of thirty terms of up to thirty, each rounded.
+    np.testing.assert_allclose(jax.jacfwd(function)(POINT), jax.jacfwd(small)(POINT), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("text", SMOOTH)
