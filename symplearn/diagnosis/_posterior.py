@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from .._effects import GAIN, HIDDEN, Oscillating
 from ._constant import constant_evidence
-from ._found import Ahead, Found, speaker
+from ._found import Found, speaker
 from ._problem import Combination, Problem
 from ._static import LARGEST
 from ._strength import faint_share
@@ -90,8 +90,8 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
             and not _is_remainder(problem, found, combination)
         ):
             price = found.prices.log(combination)
-            # What explains less than it leaves, and was not seen to predict anything, is not what was left out.
-            if found.ahead and not _predicts(found.ahead.get(combination)):
+            # What explains less than it leaves, and does not go on as it began, is not what was left out.
+            if found.ahead and not (combination in found.ahead and found.ahead[combination].holds):
                 other = float(np.logaddexp(other, price + doubtful))
                 total = float(np.logaddexp(plain + np.log(1.0 - _BESIDE), beside))
             named.append((combination, price, total, speaker(estimates)))
@@ -111,11 +111,6 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
         tempered=factor,
         is_constant=bool(constant > max(evidences[c] for c in ((), *(c for c, *_ in named))) - _AS_WELL),
     )
-
-
-def _predicts(one: Ahead | None) -> bool:
-    """Whether a trajectory goes on as it began, or at least better than that of the simulation as it is."""
-    return one is not None and (one.holds or one.is_better)
 
 
 @np.errstate(invalid="ignore")  # where neither has an evidence, which gains more does not matter
