@@ -10,6 +10,7 @@ import scipy.linalg
 import scipy.optimize
 from jaxtyping import Array, Float
 
+from ._counts import refuse_count
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
 from ._fit import Estimate
@@ -61,6 +62,7 @@ def fit_constrained(
     **Raises:** `InputError` where the gaps cannot be closed because no start learns, a leaf has no prior, or a
     trajectory leaves the reals at the start.
     """
+    refuse_count("fit_constrained", "max_steps", max_steps)
     problem = _Problem(model, recording, objective, prior if isinstance(prior, Prior) else Prior(prior))
     gaps = {"type": "eq", "fun": problem.gaps, "jac": problem.gap_slopes}
     options = {"maxiter": max_steps, "ftol": _ACCURACY}

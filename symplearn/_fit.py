@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import optimistix as ox
 from jaxtyping import Array
 
+from ._counts import refuse_count
 from ._descent import stacked, start
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
@@ -97,6 +98,7 @@ def fit(
     more terms than there are readings, the time step changes under process noise that is per data interval, or more
     than 1500 numbers learn.
     """
+    refuse_count("fit", "max_steps", max_steps)
     prior = prior if isinstance(prior, Prior) else Prior(prior)
     recordings = as_recordings(recording)
     series = recordings if isinstance(recording, list | tuple) else recordings[0]

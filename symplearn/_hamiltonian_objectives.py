@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 import integrators as ig
 
+from ._counts import refuse_count
 from ._errors import InputError
 from ._guard import guard
 from ._model import FullState, Propagator, StateSpaceModel
@@ -119,6 +120,9 @@ class MiniBatch(eqx.Module):
 
     size: int = eqx.field(static=True)
     key: PRNGKeyArray | Array
+
+    def __check_init__(self):
+        refuse_count("MiniBatch", "size", self.size)
 
 
 class OneStepL1(AbstractObjective):

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from ._arviz import arviz
+from ._counts import refuse_count
 from ._errors import InputError
 from ._fit import Estimate, fit
 from ._lane_loops import with_lane_loops
@@ -77,8 +78,10 @@ def modes(
 
     **Arguments:** `log_density` - for a posterior that `sample_density` gave, the density it was given.
 
-    **Raises:** `InputError` for such a posterior without `log_density`, or where `depth` is not positive.
+    **Raises:** `InputError` for such a posterior without `log_density`, where `depth` is not positive, and of fewer than
+    two `draws`.
     """
+    refuse_count("modes", "draws", draws, least=2)
     if posterior.estimate is None and log_density is None:
         raise InputError("This posterior does not hold its density; give `log_density`, as `sample_density` had it.")
     if not depth > 0:

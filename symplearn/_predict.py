@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from ._counts import refuse_count
 from ._errors import InputError
 from ._fit import Estimate
 from ._keys import refuse_key
@@ -140,6 +141,7 @@ def stochastic_forecast(
 
     **Raises:** `InputError` as `posterior_forecast`, and for `filtered` out of sample.
     """
+    refuse_count("stochastic_forecast", "draws", draws)
     if filtered and not in_sample:
         raise InputError("`filtered` paths start at the readings; ask for them with `in_sample=True`.")
     choice = Choice(True, measurement_noise, in_sample, state_spread, filtered)

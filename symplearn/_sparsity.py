@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from ._counts import refuse_count
 from ._errors import InputError
 
 _OPTIMAL = 1e-10  # what the lasso's optimality conditions may miss, as a share of the largest possible slope
@@ -110,6 +111,7 @@ class SequentialThresholding(AbstractPenalty):
     max_steps: int = eqx.field(static=True, default=20)
 
     def __check_init__(self):
+        refuse_count("SequentialThresholding", "max_steps", self.max_steps)
         if not (self.threshold >= 0 and self.ridge >= 0):
             given = f"{self.threshold} and {self.ridge}"
             raise InputError(f"`SequentialThresholding` needs a threshold and a ridge of at least 0, but got {given}.")

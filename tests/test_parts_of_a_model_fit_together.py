@@ -153,6 +153,8 @@ COUNTS = {
     "DoubledPropagator": lambda n: sl.DoubledPropagator(potential(), ig.Tao(1.0), substeps=n),
     "ForwardEuler": lambda n: sl.ForwardEuler(lambda x: x, substeps=n),
     "EverySteps": sl.EverySteps,
+    "MiniBatch": lambda n: sl.MiniBatch(n, jax.random.key(0)),
+    "SequentialThresholding": lambda n: sl.SequentialThresholding(0.1, max_steps=n),
     "RandomWalk": lambda n: sl.RandomWalk(thin=n),
     "NUTS": lambda n: sl.NUTS(draws=n),
     "GaussHermite": sl.GaussHermite,
@@ -166,6 +168,22 @@ def test_counts_are_whole_numbers(owner, given):
     """A step that is cut in two and a half integrates over another time: what counts is a whole number."""
     with pytest.raises(InputError, match=f"`{owner}` needs .* whole number, but was given {given!r}"):
         COUNTS[owner](given)
+
+
+VERBS = {
+    "fit": lambda n: sl.fit(None, None, prior=sl.Flat(), max_steps=n),
+    "fit_constrained": lambda n: sl.fit_constrained(None, None, None, prior=sl.Flat(), max_steps=n),
+    "modes": lambda n: sl.modes(None, draws=n),
+    "stochastic_forecast": lambda n: sl.stochastic_forecast(None, draws=n, key=jax.random.key(0)),
+}
+
+
+@pytest.mark.parametrize("given", [2.5, 0])
+@pytest.mark.parametrize("verb", VERBS)
+def test_verbs_refuse_counts_of_nothing(verb, given):
+    """A fit of no step and a forecast of no draw, or of a part of one, are refused before anything is looked at."""
+    with pytest.raises(InputError, match=f"`{verb}` needs .* whole number, but was given {given!r}"):
+        VERBS[verb](given)
 
 
 def test_integrators_count_whole_substeps():
