@@ -78,8 +78,8 @@ def modes(
 
     **Arguments:** `log_density` - for a posterior that `sample_density` gave, the density it was given.
 
-    **Raises:** `InputError` for such a posterior without `log_density`, where `depth` is not positive, and of fewer than
-    two `draws`.
+    **Raises:** `InputError` for such a posterior without `log_density`, where `depth` is not positive, or of fewer
+    than two `draws`.
     """
     refuse_count("modes", "draws", draws, least=2)
     if posterior.estimate is None and log_density is None:

@@ -65,6 +65,7 @@ def test_what_predicts_is_ahead(clear):
     score = {c: found.ahead[c].score for c in (nothing, damping, drag)}
     assert score[drag] == 0.0 and found.ahead[drag].holds
     assert -10.0 <= score[nothing] < score[damping] < -1.0
+    assert found.ahead[drag].is_better and found.ahead[damping].is_better and not found.ahead[nothing].is_better
 
 
 def test_the_trajectory_that_holds_is_shown(clear):

@@ -222,16 +222,21 @@ def test_beside_a_finding_a_remainder_has_a_quarter(problem):
 
 @pytest.mark.parametrize(
     ("ahead", "counts"),
-    [(Ahead(-0.5, True), True), (Ahead(0.0, False), False), (None, False)],
+    [
+        (Ahead(0.0, True, False), True),
+        (Ahead(-0.5, False, True), True),
+        (Ahead(-1.5, False, False), False),
+        (None, False),
+    ],
 )
 def test_findings_that_explain_less_than_they_leave_must_predict(problem, ahead, counts):
     """Of an effect that gains 2 nats beside a coloured error that gains 3, that part counts as unexplained where the
-    fit does not go on ahead as it began, however well it scores, or was not tried; beside remainders that gain less it
-    is the effect all the same."""
+    fit neither goes on ahead as it began nor predicts better than nothing does, or was not tried; beside remainders
+    that gain less it is the effect all the same."""
     one, nothing = (place(problem, "viscous_damping", "q1"),), [estimate(problem, (), 0.0, kind) for kind in KINDS]
     values = {"white": 2.0, "coloured": 5.0, "clock": 3.0}
     kept = found(problem, *nothing, *(estimate(problem, one, value, kind) for kind, value in values.items()))
-    kept.ahead = {(): Ahead(-3.0, False)} | ({} if ahead is None else {one: ahead})
+    kept.ahead = {(): Ahead(-3.0, False, False)} | ({} if ahead is None else {one: ahead})
     p = posterior(problem, kept, 1.0)
     small, large = 3 / 4 * np.exp(2.0) + 1 / 4 / OTHERS * np.exp(3.0), 1 / FAMILIES / OTHERS * np.exp(5.0)
     mine, rest = (small + large, 0.0) if counts else (small, large)
@@ -245,7 +250,7 @@ def test_how_a_trajectory_goes_on_says_nothing_of_a_spell(problem):
     """A score ahead counts for every kind of remainder but the force that acts for a while."""
     nothing, one = [estimate(problem, (), 0.0, kind) for kind in KINDS], (place(problem, "viscous_damping", "q1"),)
     kept = found(problem, *nothing, *alike(problem, one, 0.0))
-    kept.ahead = {(): Ahead(-4.0, False), one: Ahead(0.0, True)}
+    kept.ahead = {(): Ahead(-4.0, False, False), one: Ahead(0.0, True, True)}
     p = posterior(problem, kept, 1.0)
     alone = np.mean([*[1.0] * (OTHERS - 1), np.exp(4.0)]) / FAMILIES
     assert p.unexplained / p.as_it_is == pytest.approx(alone, rel=1e-9)
@@ -256,7 +261,7 @@ def test_beside_a_spell_a_finding_need_not_go_on(problem):
     predicts: where the force acts no trajectory goes on."""
     one, nothing = (place(problem, "viscous_damping", "q1"),), [estimate(problem, (), 0.0, kind) for kind in KINDS]
     kept = found(problem, *nothing, estimate(problem, one, 2.0), estimate(problem, one, 32.0, "spell"))
-    kept.ahead = {(): Ahead(0.0, False), one: Ahead(0.0, False)}
+    kept.ahead = {(): Ahead(0.0, False, False), one: Ahead(0.0, False, False)}
     p = posterior(problem, kept, 1.0)
     expected = DAMPING * (3 / 4 * np.exp(2.0) + np.exp(32.0) / FAMILIES / OTHERS)
     assert p.named[0].probability / p.as_it_is == pytest.approx(expected, rel=1e-9)

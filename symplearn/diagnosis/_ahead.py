@@ -24,6 +24,8 @@ _CLEAR, _REACH, _WORST = 10.0, 100.0, 10.0
 _MOST = 16
 # Shares of the rows that are fitted, steps of each fit, and what one channel's free run counts for.
 _ORIGINS, _STEPS, _READINGS = (0.4, 0.6, 0.8), 20, 2.0
+# Nats by which a combination scores clearly above nothing.
+_BETTER = 2.0
 # A trajectory fit that errs no more ahead than this many times as much as where it was fitted holds on.
 _HOLDS = 3.0
 # Share of the fitted rows that what happens at one time has to happen before, to be known from them.
@@ -63,8 +65,9 @@ def _scores(
     total = np.where(np.isfinite(total), total, -np.inf)
     if not np.isfinite(total.max()):
         return {}
-    score = np.maximum(total - total.max(), -_WORST)
-    return {c: Ahead(float(s), bool(h)) for c, s, h in zip(combinations, score, holds, strict=True)}
+    bare = total[combinations.index(())] if () in combinations else -np.inf
+    better, score = total > bare + _BETTER, np.maximum(total - total.max(), -_WORST)
+    return {c: Ahead(float(s), bool(h), bool(b)) for c, s, h, b in zip(combinations, score, holds, better, strict=True)}
 
 
 def _before_it(problem: Problem, combination: Combination) -> Combination:

@@ -25,11 +25,12 @@ _FLATTEST = 1e-12
 
 @dataclass(frozen=True)
 class Ahead:
-    """How a combination predicts rows that a trajectory fit has not seen: a score in nats, at most zero, and whether it
-    errs there hardly more than where it was fitted."""
+    """How a combination predicts rows that a trajectory fit has not seen: a score in nats, at most zero, whether it
+    errs there hardly more than where it was fitted, and whether clearly less than the simulation as it is."""
 
     score: float
     holds: bool
+    is_better: bool
 
 
 def speaker(estimates: Sequence[Estimate]) -> Estimate:

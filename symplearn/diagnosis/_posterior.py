@@ -9,6 +9,7 @@ from jaxtyping import Float
 from .._effects import GAIN, HIDDEN, Oscillating
 from ._constant import constant_evidence
 from ._found import Found, speaker
+from ._own_period import in_tune
 from ._problem import Combination, Problem
 from ._static import LARGEST
 from ._strength import faint_share
@@ -90,8 +91,8 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
             and not _is_remainder(problem, found, combination)
         ):
             price = found.prices.log(combination)
-            # What explains less than it leaves, and does not go on as it began, is not what was left out.
-            if found.ahead and not (combination in found.ahead and found.ahead[combination].holds):
+            # What explains less than it leaves, and was not seen to predict anything, is not what was left out.
+            if found.ahead and not _predicts(problem, found, combination):
                 other = float(np.logaddexp(other, price + doubtful))
                 total = float(np.logaddexp(plain + np.log(1.0 - _BESIDE), beside))
             named.append((combination, price, total, speaker(estimates)))
@@ -111,6 +112,15 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
         tempered=factor,
         is_constant=bool(constant > max(evidences[c] for c in ((), *(c for c, *_ in named))) - _AS_WELL),
     )
+
+
+def _predicts(problem: Problem, found: Found, combination: Combination) -> bool:
+    """Whether a trajectory goes on as it began, or at least better than that of the simulation as it is. The latter is
+    nothing to what has the motion's own period: that bends after whatever goes with the motion, for a while."""
+    one = found.ahead.get(combination)
+    if one is None or one.holds:
+        return one is not None
+    return one.is_better and not in_tune(problem, speaker(found.estimates[combination]))
 
 
 @np.errstate(invalid="ignore")  # where neither has an evidence, which gains more does not matter
