@@ -115,8 +115,8 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
 
 
 def _predicts(problem: Problem, found: Found, combination: Combination) -> bool:
-    """Whether a trajectory goes on as it began, or at least better than that of the simulation as it is. The latter does
-    not count where something has the motion's own period, which for a while follows whatever goes with the motion."""
+    """Whether a trajectory goes on as it began, or at least better than that of the simulation as it is. The latter
+    does not count where something has the motion's own period, which for a while follows whatever goes with it."""
     one = found.ahead.get(combination)
     if one is None or one.holds:
         return one is not None
