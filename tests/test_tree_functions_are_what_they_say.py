@@ -54,7 +54,7 @@ def test_slopes_that_are_trees_are_those_of_the_function():
         np.testing.assert_allclose(*both, rtol=1e-13, atol=1e-14)  # a few roundings
     many = POINT[:, None] * jnp.array([1.0, 0.9])
     along = (jax.jit(lambda x, f=function: jax.jvp(f, (x,), (x,))[1])(many) for function in (ours, plain))
-    np.testing.assert_allclose(*along, rtol=1e-13)
+    np.testing.assert_allclose(*along, rtol=1e-13)  # a few roundings; none cancels. Seen: 6e-16
     twice = (jax.jit(jax.jacfwd(jax.jacfwd(function)))(POINT) for function in (ours, plain))
     np.testing.assert_allclose(*twice, rtol=1e-12, atol=1e-13)  # a few more
     assert "custom_jvp_call" in str(jax.make_jaxpr(ours)(POINT))
