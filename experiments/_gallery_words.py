@@ -108,7 +108,7 @@ def _difference(before: float | None, after: float | None) -> str:
 def _verdict_line(document: Mapping[str, Any]) -> str:
     evidence = document["log_bayes_factor"]
     line = f"Verdict: **{document['verdict']}**, probability {document['probability']:.3f}"
-    line += "" if evidence is None else f", {number(evidence, 4)} nats above the simulation without effects"
+    line += f", {number(evidence, 4)} nats above the simulation without effects" if document["findings"] else ""
     families = document["family_probability"].items()
     told = ", ".join(f"{family} {probability:.3f}" for family, probability in families if probability >= 0.001)
     return line + "." + (f" By kind: {told}." if told else "")

@@ -86,10 +86,14 @@ def observed_order(
 
     **Arguments:**
 
-    - `steps`: the counts of steps, in increasing order.
+    - `steps`: the counts of steps, at least two, in increasing order.
     - `reference`: the true end point; by default the same method with 16 times the most steps, which biases
       the slope of a method of order 2 by less than 0.01.
+
+    **Raises:** `ValueError` where `steps` are fewer than two different counts, which have no slope.
     """
+    if len(set(steps)) < 2:
+        raise ValueError(f"`observed_order` needs at least two different counts of `steps`, but was given {steps}.")
     integrator.accepts(system)
     strong = _strong(system, integrator, x0, 0.0, duration)
     if reference is None:

@@ -78,7 +78,7 @@ class _Problem:
     def __init__(self, model: StateSpaceModel, recording: Any, objective: MultipleShooting, prior: Prior):
         self.series, self.objective, self.prior = as_recordings(recording), objective, prior
         vector, self.rebuild = flatten(model)
-        self.start, self._last = np.asarray(vector), np.full(vector.size, np.nan)
+        self.start, self._last = np.asarray(vector, dtype=float), np.full(vector.size, np.nan)
         self._values: tuple[np.ndarray, ...] = ()
         if not self.score(self.start) < -IMPOSSIBLE:
             raise InputError(
@@ -96,7 +96,7 @@ class _Problem:
     def values(self, free: np.ndarray) -> tuple[np.ndarray, ...]:
         if not np.array_equal(free, self._last):
             numbers = _values(self.rebuild(jnp.asarray(free)), self.series, self.objective, self.prior)
-            self._last, self._values = np.array(free), tuple(np.asarray(number) for number in numbers)
+            self._last, self._values = np.array(free), tuple(np.asarray(number, dtype=float) for number in numbers)
         return self._values
 
     def score(self, free: np.ndarray) -> float:

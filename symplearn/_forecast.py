@@ -1,6 +1,5 @@
 """What comes after a recording: one deterministic path, and a Gaussian by the filter's own moments."""
 
-import math
 from typing import Any
 
 import equinox as eqx
@@ -11,6 +10,7 @@ from jaxtyping import Array, Float
 
 from ._errors import InputError
 from ._fit import Estimate
+from ._forecast_grid import input_rows, times_until
 from ._model import AbstractStateSpaceModel, Instant, intervals_between
 from ._objectives import MarginalLikelihood
 from ._parameters import resolve
@@ -40,15 +40,16 @@ class Forecast(eqx.Module):
         return f"Forecast of {self.times.shape[0]} readings from {first:g} to {last:g}: {ends}"
 
 
-def forecast(estimate: Estimate, *, until: float | None = None, times: Any = None) -> Forecast:
+def forecast(estimate: Estimate, *, until: float | None = None, times: Any = None, inputs: Any = None) -> Forecast:
     """Forecast an estimate beyond its recording.
 
     **Arguments:** give one of `until` - the last time, in steps of the recording's last interval; `times` -
-    increasing times after the recording's last. Process noise of `AdditiveGaussian` is added once per
+    increasing times after the recording's last; and, of a driven model, `inputs` (time + 1, input), held from the
+    recording's last time and from each of the times after it. Process noise of `AdditiveGaussian` is added once per
     forecast interval, so with it keep to the recording's spacing.
 
-    **Raises:** `InputError` where not exactly one is given, times do not lie ahead, or the forecast is not
-    finite.
+    **Raises:** `InputError` where not exactly one is given, times do not lie ahead, inputs do not fit, or the forecast
+    is not finite.
     """
     objective = estimate.objective if isinstance(estimate.objective, MarginalLikelihood) else MarginalLikelihood()
     series = estimate.recording
@@ -61,7 +62,8 @@ def forecast(estimate: Estimate, *, until: float | None = None, times: Any = Non
     filtered = objective.filter(estimate.model, series)
     grid = jnp.concatenate([series.times[-1:], jnp.asarray(ahead)])
     start = filtered.filtered_means[-1], filtered.filtered_covariances[-1]
-    result = _push_forward(resolve(estimate.model), objective.transform, grid, *start)
+    rows = input_rows(series, inputs, len(grid))
+    result = _push_forward(resolve(estimate.model), objective.transform, grid, rows, *start)
     if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in (*jax.tree.leaves(result), *start)):
         raise InputError(f"The forecast is not finite before t = {ahead[-1]:g}: the model escapes. Forecast less far.")
     return result
@@ -72,20 +74,26 @@ def _times_ahead(recorded: np.ndarray, until: float | None, times: Any) -> np.nd
         raise InputError("`forecast` needs either `until` or `times`, and not both.")
     last, spacing = recorded[-1], recorded[-1] - recorded[-2]
     if times is None:
-        # The small share lets `until` itself be reached in spite of round-off.
-        count = math.floor((float(until or 0.0) - last) / spacing + 1e-6)
-        times = last + spacing * np.arange(1, count + 1)
+        times = times_until(float(until or 0.0), last, spacing)
     ahead = np.asarray(times, dtype=float)
-    if ahead.ndim != 1 or len(ahead) == 0 or not np.all(np.diff(np.concatenate([[last], ahead])) > 0):
+    if (
+        ahead.ndim != 1
+        or len(ahead) == 0
+        or not np.isfinite(ahead).all()
+        or not np.all(np.diff(np.concatenate([[last], ahead])) > 0)
+    ):
         raise InputError(
-            f"A forecast needs increasing times after the recording's last, {last:g}; one interval is {spacing:g}."
+            f"A forecast needs finite, increasing times after the recording's last, {last:g}; "
+            f"one interval is {spacing:g}."
         )
     return ahead
 
 
 @eqx.filter_jit
-def _push_forward(model: AbstractStateSpaceModel, transform: AbstractTransform, grid: Array, m: Array, P: Array):
-    known, instants = jnp.zeros_like(P), Instant(grid[1:])
+def _push_forward(
+    model: AbstractStateSpaceModel, transform: AbstractTransform, grid: Array, inputs: Any, m: Array, P: Array
+):
+    known, instants = jnp.zeros_like(P), Instant(grid[1:], None if inputs is None else inputs[1:])
 
     def step(carry, data):
         interval, instant = data
@@ -100,5 +108,5 @@ def _push_forward(model: AbstractStateSpaceModel, transform: AbstractTransform, 
         return (x, m, root), (path, read.mean, sd, x, m, root @ root.T)
 
     start = m, m, semidefinite_cholesky(P)
-    _, ahead = jax.lax.scan(step, start, (intervals_between(grid), instants))
+    _, ahead = jax.lax.scan(step, start, (intervals_between(grid, inputs), instants))
     return Forecast(grid[1:], *ahead)

@@ -4,12 +4,16 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from ._counts import refuse_count
 from ._errors import InputError
 from ._model import AbstractAffine, Propagator
 from ._noise import WienerIncrement
 from ._objectives import TimeSeries
+
+# Times ahead that can be asked for: more are a slip, and would not fit into memory.
+_MOST_TIMES = 10_000_000
 
 
 class Grid(NamedTuple):
@@ -56,8 +60,7 @@ def _wanted(series: TimeSeries, times: Any, until: float | None, in_sample: bool
         raise InputError("A forecast needs either `until` or `times`, and not both.")
     start, spacing = recorded[0] if in_sample else recorded[-1], recorded[-1] - recorded[-2]
     if times is None:
-        count = math.floor((float(until or 0.0) - start) / spacing + 1e-6)
-        times = start + spacing * np.arange(1, count + 1)
+        times = times_until(float(until or 0.0), start, spacing)
     wanted = np.asarray(times, dtype=float)
     lowest = wanted.ndim == 1 and len(wanted) > 0 and (wanted[0] >= start if in_sample else wanted[0] > start)
     if not lowest or not np.all(np.isfinite(wanted)) or not np.all(np.diff(wanted) > 0):
@@ -66,23 +69,49 @@ def _wanted(series: TimeSeries, times: Any, until: float | None, in_sample: bool
     return wanted
 
 
+def times_until(until: float, start: float, spacing: float) -> Float[np.ndarray, " time"]:
+    """Times after `start` in steps of `spacing`, up to `until`.
+
+    **Raises:** `InputError` where `until` is not finite, or they are more than can be held.
+    """
+    if not math.isfinite(until) or (until - start) / spacing > _MOST_TIMES:
+        raise InputError(
+            f"`until` = {until:g} is not within {_MOST_TIMES:,} intervals of {spacing:g} after t = {start:g}; "
+            "forecast less far, or give `times`."
+        )
+    # The small share lets `until` itself be reached in spite of round-off.
+    return start + spacing * np.arange(1, math.floor((until - start) / spacing + 1e-6) + 1)
+
+
 def _held(grid: Grid, series: TimeSeries, inputs: Any) -> Any:
     """The input at each instant of the grid: the latest row given."""
+    if inputs is None and series.inputs is not None and grid.times[-1] <= np.asarray(series.times)[-1]:
+        times, rows = np.asarray(series.times), np.asarray(series.inputs)
+    else:
+        times = np.unique(np.concatenate([grid.times[:1], grid.times[grid.wanted]]))
+        given = input_rows(series, inputs, len(times))
+        if given is None:
+            return None
+        rows = given
+    return rows[np.maximum(np.searchsorted(times, grid.times + 1e-9 * grid.spacing, side="right") - 1, 0)]
+
+
+def input_rows(series: TimeSeries, inputs: Any, rows: int) -> Float[np.ndarray, "time input"] | None:
+    """Inputs ahead of a recording, a row from its end on and one from each time after it; None where nothing drives.
+
+    **Raises:** `InputError` where the recording has inputs and none are given, or theirs is another shape.
+    """
     if inputs is None and series.inputs is None:
         return None
     if inputs is None:
-        times, rows = np.asarray(series.times), np.asarray(series.inputs)
-        if grid.times[-1] > times[-1]:
-            raise InputError("The model is driven, and the recording's inputs end with it; give `inputs`.")
-    else:
-        times = np.unique(np.concatenate([grid.times[:1], grid.times[grid.wanted]]))
-        rows = np.asarray(inputs, dtype=float)
-    if rows.ndim != 2 or len(rows) != len(times) or not np.all(np.isfinite(rows)):
+        raise InputError("The model is driven, and the recording's inputs end with it; give `inputs`.")
+    given = np.asarray(inputs, dtype=float)
+    if given.ndim != 2 or len(given) != rows or not np.all(np.isfinite(given)):
         raise InputError(
-            f"`inputs` must be finite and of shape ({len(times)}, input): a row for the start of the paths and one for "
-            f"each time after it, but have the shape {rows.shape}."
+            f"`inputs` must be finite and of shape ({rows}, input): a row for the start of the paths and one for "
+            f"each time after it, but have the shape {given.shape}."
         )
-    return rows[np.maximum(np.searchsorted(times, grid.times + 1e-9 * grid.spacing, side="right") - 1, 0)]
+    return given
 
 
 def substeps_of(model: Any, grid: Grid, substeps: int | None) -> int | None:

@@ -93,7 +93,7 @@ class Flat(AbstractDensity):
 class InverseWishart(AbstractMatrixDensity):
     """The inverse Wishart density of a `PositiveDefinite` matrix; its mean is scale / (dof - dim - 1).
 
-    **Arguments:** `dof` - above dim - 1; `scale` (dim, dim), positive definite.
+    **Arguments:** `dof` - above dim - 1; `scale` (dim, dim), symmetric and positive definite.
 
     **Raises:** `InputError` where they are not.
     """
@@ -104,10 +104,10 @@ class InverseWishart(AbstractMatrixDensity):
     def __check_init__(self):
         if self.scale.ndim != 2 or self.scale.shape[0] != self.scale.shape[1]:
             raise InputError(f"`InverseWishart` needs a scale of shape (dim, dim), but was given {self.scale.shape}.")
-        spread = jnp.all(jnp.isfinite(jnp.linalg.cholesky(self.scale)))
+        spread = jnp.all(jnp.isfinite(jnp.linalg.cholesky(self.scale))) & jnp.allclose(self.scale, self.scale.T)
         require(
             (self.dof > self.scale.shape[0] - 1) & spread,
-            "`InverseWishart` needs a dof above dim - 1 and a positive definite scale.",
+            "`InverseWishart` needs a dof above dim - 1 and a symmetric, positive definite scale.",
         )
 
     def suits(self, leaf: Any) -> bool:

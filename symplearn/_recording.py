@@ -51,7 +51,9 @@ def read_recordings(simulation: SimulationFile, paths: str | Path | Sequence[str
     paths = [paths] if isinstance(paths, str | Path) else paths
     if not paths:
         raise InputError(f"{simulation.name}: no recording was given; give at least one CSV file")
-    parts = [part for path in paths for part in _parts(simulation, path)]
+    plain = [Path(path).name for path in paths]
+    names = [str(path) if plain.count(name) > 1 else name for path, name in zip(paths, plain, strict=True)]
+    parts = [part for path, name in zip(paths, names, strict=True) for part in _parts(simulation, path, name)]
     _check_bounds(simulation, parts)
     recordings = [_recording(simulation, part, number) for number, part in enumerate(parts, start=1)]
     check_recordings(simulation, recordings)
@@ -68,11 +70,11 @@ class _Part:
     rows: np.ndarray
 
 
-def _parts(simulation: SimulationFile, path: str | Path) -> Iterator[_Part]:
+def _parts(simulation: SimulationFile, path: str | Path, called: str) -> Iterator[_Part]:
     section = simulation.recording
     numbers = [section.time, *section.observe, *section.inputs]
     columns = read_columns(path, numbers=numbers, texts=section.group, where=section.where)
-    name = shown(Path(path).name, 200)[1:-1]
+    name = shown(called, 200)[1:-1]
     if len(columns.lines) == 0:
         wanted = ", ".join(f"{column} = {value}" for column, value in section.where.items())
         advice = f"none has {shown(wanted)}; correct `where`" if wanted else "give rows of numbers below the header"

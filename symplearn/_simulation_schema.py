@@ -142,8 +142,11 @@ def quantity(entry: float | CalibratedTable, where: str) -> Quantity:
     if entry.positive and not entry.value > 0:
         raise InputError(f"{where}: value = {entry.value:g} but positive = true; give a value above zero")
     lower, upper = entry.lower, entry.upper
-    if lower is not None and not entry.value > lower or upper is not None and not entry.value < upper:
-        limits = f"{'' if lower is None else f'{lower:g} < '}value{'' if upper is None else f' < {upper:g}'}"
+    if lower is not None and upper is not None and not lower < upper:
+        raise InputError(f"{where}: lower = {lower:g} and upper = {upper:g} leave no room; give lower < upper")
+    # A value may stand on a limit, where a calibration leaves one that it would move further.
+    if lower is not None and not entry.value >= lower or upper is not None and not entry.value <= upper:
+        limits = f"{'' if lower is None else f'{lower:g} <= '}value{'' if upper is None else f' <= {upper:g}'}"
         raise InputError(f"{where}: value = {entry.value:g} is outside its limits; {limits} is needed")
     if entry.positive and upper is not None and upper <= 0:
         raise InputError(f"{where}: positive = true but upper = {upper:g}; give an upper limit above zero")

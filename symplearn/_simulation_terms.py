@@ -1,6 +1,7 @@
 """`[[terms]]` of a simulation file: physics already added, in the words of the contract's section 3."""
 
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from typing import Any
 
 from ._errors import InputError, nearest, shown
@@ -99,7 +100,8 @@ class TermReader:
         forbidden, needed = FORBIDDEN.get((word.name, name), (None, ""))
         if forbidden is not None and forbidden(result.value):
             raise InputError(f"{where}: {result.value:g} was given, but {name} of {word.name} must {needed}")
-        return result
+        # What is calibrated stays so: a friction that is not there must not come back as one that drives.
+        return result if result.known else replace(result, positive=result.positive or name in word.positive)
 
     def side(self, data: Mapping[str, Any], word: Word, where: str) -> str | None:
         if not word.sides:

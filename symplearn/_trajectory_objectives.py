@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ._counts import refuse_count
+from ._counts import is_count, refuse_count
 from ._errors import InputError
 from ._faults import IMPOSSIBLE
 from ._guard import guard
@@ -53,11 +53,16 @@ class StartingAt(AbstractSegmentation):
     ends before the last of them.
     """
 
-    indices: tuple[int, ...] = eqx.field(static=True)
+    indices: tuple[int, ...] = eqx.field(static=True, converter=tuple)
 
     def __check_init__(self):
-        if self.indices[:1] != (0,) or any(b <= a for a, b in zip(self.indices, self.indices[1:], strict=False)):
-            raise ValueError(f"`StartingAt` needs increasing indices from 0 on, but was given {self.indices}.")
+        whole = all(is_count(index, 0) for index in self.indices)
+        if (
+            not whole
+            or self.indices[:1] != (0,)
+            or any(b <= a for a, b in zip(self.indices, self.indices[1:], strict=False))
+        ):
+            raise ValueError(f"`StartingAt` needs increasing whole numbers from 0 on, but was given {self.indices}.")
 
     def starts(self, intervals: int) -> tuple[int, ...]:
         if self.indices[-1] >= intervals:

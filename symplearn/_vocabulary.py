@@ -53,6 +53,9 @@ VOCABULARY: dict[str, Word] = {word.name: word for word in _WORDS}
 # What a coefficient may not be, besides negative where it is positive by convention.
 FORBIDDEN: dict[tuple[str, str], tuple[Callable[[float], bool], str]] = {
     ("self_excitation", "a"): (lambda value: value == 0, "be other than zero"),
+    ("periodic_forcing", "omega"): (lambda value: value == 0, "be greater than zero"),
+    ("parametric_modulation", "omega"): (lambda value: value == 0, "be greater than zero"),
+    ("hidden_oscillator", "omega"): (lambda value: value == 0, "be greater than zero"),
     ("sensor_noise", "s"): (lambda value: value == 0, "be greater than zero"),
     ("sensor_outliers", "sd"): (lambda value: value == 0, "be greater than zero"),
     ("sensor_outliers", "e"): (lambda value: value > 1, "lie between 0 and 1"),

@@ -128,6 +128,7 @@ def _check_verdict(document):
         assert document["parameters"]["after"] == document["parameters"]["before"]
     else:
         number(document["log_bayes_factor"])
+        assert verdict == "mismatch" or document["log_bayes_factor"] == 0.0  # against itself
         assert document["location"]["targets"]
     if verdict == "mismatch":
         sensor = {one["family"] == "sensor" for one in findings}

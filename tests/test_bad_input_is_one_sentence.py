@@ -111,6 +111,9 @@ TOML = {
     "sd inf": changed("sd = 0.01", "sd = inf"),
     "value below lower": changed("sd = 0.01", "lower = 0.5"),
     "value above upper": changed("sd = 0.01", "upper = 0.1"),
+    "limits without room": changed("sd = 0.01", "lower = 0.4, upper = 0.2"),
+    "a forcing that never comes round": GOOD
+    + '[[terms]]\neffect = "periodic_forcing"\ntarget = "theta"\na = 1.0\nomega = 0\nphi = 0.0\n',
     "positive but negative": changed("value = 0.30", "value = -0.3, positive = true"),
     "positive a number": changed("sd = 0.01", "positive = 1"),
     "initial of unknown": changed("theta = { value = 1.0, sd = 0.1 }", "thta = 1"),
@@ -285,6 +288,15 @@ def test_wrong_recordings(text, reason, tmp_path):
     simulation = parse_simulation(GOOD, "pendulum.toml")
     sentence = refused(lambda: read_recordings(simulation, [path]), "swing.csv")
     assert re.search(reason, sentence)
+
+
+def test_files_of_one_name_are_told_apart(tmp_path):
+    """Of two files called alike what is wrong in one is told by its folder, too."""
+    simulation, folders = parse_simulation(GOOD, "pendulum.toml"), [tmp_path / "first", tmp_path / "second"]
+    for folder, rows in zip(folders, (ROWS, [*ROWS[:-1], ROWS[1]]), strict=True):
+        folder.mkdir()
+        (folder / "swing.csv").write_text("\n".join(rows))
+    refused(lambda: read_recordings(simulation, [folder / "swing.csv" for folder in folders]), "second/swing.csv")
 
 
 def test_paths_that_are_no_recording(tmp_path):

@@ -101,6 +101,15 @@ def test_an_angle_that_nothing_reads_is_not_wound_up(hamiltonian, observe, more,
     np.testing.assert_array_equal(found[1:], z[1:])
 
 
+def test_a_length_in_a_small_unit_is_no_angle():
+    """Of 1.5e11 m a whole turn is lost in rounding, and changes neither force nor reading; all turns together do."""
+    file = cases.simulation("p**2/2 + q**2/2")
+    problem = cases.problem(file, [cases.recorded(TIMES, 1.5e11 * np.cos(TIMES))], 0.25)
+    z = np.zeros(problem.size)
+    z[:2] = 1.5e11, 1e9
+    np.testing.assert_array_equal(without_turns(problem, z), z)
+
+
 ORBITS = ((0.8, -1.3, 0.7, 0.4), (1.0, 0.6, 0.5, -0.8))
 
 

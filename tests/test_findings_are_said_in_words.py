@@ -73,6 +73,15 @@ def test_what_it_does_has_the_sign_and_number_of_its_coefficients(name, changed,
     assert words in said(name, units=units, **changed)
 
 
+@pytest.mark.parametrize("name", ["viscous_damping", "quadratic_drag", "coulomb_friction", "relative_damping"])
+def test_a_loss_that_is_taken_back_is_no_loss_left_out(name):
+    """A negative coefficient is added to a known term that is too strong: nothing was left out, and less is lost."""
+    (coefficient,) = VOCABULARY[name].coefficients
+    text = said(name, **{coefficient: -0.2})
+    assert "that the simulation has is too strong" in text and "less energy is taken out" in text
+    assert "left out" not in text and "left out" in said(name, **{coefficient: 0.2})
+
+
 def test_a_stop_acts_on_its_own_side():
     """The upper stop acts above its place, the lower one below."""
     assert "only while theta is above 0.7" in said("contact_stop", "upper")

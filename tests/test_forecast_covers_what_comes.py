@@ -9,6 +9,7 @@ import pytest
 from symplearn._errors import InputError
 from symplearn._fit import Estimate
 from symplearn._forecast import forecast
+from symplearn._model import LinearDynamics
 from symplearn._objectives import MarginalLikelihood, TimeSeries
 from symplearn._prior import Flat, Prior
 
@@ -62,6 +63,27 @@ def test_times_of_ones_own_may_be_asked():
     assert np.array_equal(ahead.times, [N + 1.0, N + 3.0])
 
 
+def test_a_driven_model_is_forecast_with_its_inputs():
+    """With inputs held from each time on, states to come are x <- A x + B u from the last filtered mean; without, or
+    with too few of them, nothing is forecast."""
+    A, H, Q, R, m0, P0 = cases.linear_system()
+    B, rng = np.array([[0.3], [-0.2], [0.5]]), np.random.default_rng(3)
+    u, ys = rng.normal(size=(N + AHEAD, 1)), recorded(0)
+    one = estimated(ys[:N])
+    model = eqx.tree_at(lambda m: m.dynamics, one.model, LinearDynamics(jnp.asarray(A), jnp.asarray(B)))
+    series = TimeSeries(jnp.arange(float(N)), jnp.asarray(ys[:N]), jnp.asarray(u[:N]))
+    driven = Estimate(model, series, MarginalLikelihood(), Prior(Flat()), 0.0, 0.0, 0.0, 0.0, True, 0)
+    m = MarginalLikelihood().filter(model, series).filtered_means[-1]
+    ahead = forecast(driven, until=N - 1.0 + AHEAD, inputs=u[N - 1 :])
+    for k in range(AHEAD):
+        m = A @ m + B @ u[N - 1 + k]
+        np.testing.assert_allclose(ahead.state_means[k], m, atol=1e-12)
+    with pytest.raises(InputError, match="give `inputs`"):
+        forecast(driven, until=N - 1.0 + AHEAD)
+    with pytest.raises(InputError, match=r"of shape \(7, input\)"):
+        forecast(driven, until=N - 1.0 + AHEAD, inputs=u[N:])
+
+
 def test_bad_requests_are_refused():
     """Both or neither of `until` and `times`, times in the past, and a model that escapes are refused."""
     estimate = estimated(recorded(0)[:N])
@@ -71,6 +93,11 @@ def test_bad_requests_are_refused():
     for request in ({"until": 3.0}, {"times": [3.0, 20.0]}, {"times": []}):
         with pytest.raises(InputError, match="after the recording's last"):
             forecast(estimate, **request)
+    for request in ({"until": np.nan}, {"until": np.inf}, {"until": 1e9}):
+        with pytest.raises(InputError, match="is not within 10,000,000 intervals"):
+            forecast(estimate, **request)
+    with pytest.raises(InputError, match="finite, increasing"):
+        forecast(estimate, times=[20.0, np.inf])
     growing = eqx.tree_at(lambda e: e.model.dynamics.A, estimate, 1e80 * jnp.eye(3))
     with pytest.raises(InputError, match="not finite"):
         forecast(growing, until=N - 1.0 + AHEAD)

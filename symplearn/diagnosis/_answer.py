@@ -211,13 +211,12 @@ class Answer:
         return p.as_it_is if self.verdict == "consistent" else p.unexplained
 
     def _bayes_factor(self) -> float | None:
+        """Of the answer against the best simulation without effects, process noise allowed; `unexplained` is that."""
         p = self.posterior
         if self.verdict == "consistent":
             return None
         if self.chosen is None:
-            white = self.found.of((), "white")
-            plain = white.log_evidence if white else -np.inf
-            return document.finite(p.tempered * (self.before.log_evidence - plain))
+            return 0.0
         return document.finite(p.evidences[self.chosen.combination] - p.evidences[()])
 
     def _findings(self) -> list[dict[str, Any]]:

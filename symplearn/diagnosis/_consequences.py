@@ -20,6 +20,11 @@ class Said:
     def mean(self, name: str) -> float:
         return float(self.coefficients[name]["mean"])
 
+    @property
+    def takes_back(self) -> bool:
+        """Whether it takes from a loss that a known term has too much of: losses are positive otherwise."""
+        return self.one.effect.family == "dissipation" and self.mean(self.one.effect.coefficients[0]) < 0
+
     def value(self, name: str) -> str:
         """`0.03 +- 0.002 N/m`."""
         return _with_unit(self._spread(name, 1.0), self.units.get(name))
@@ -62,6 +67,8 @@ class Said:
 
 def consequence(said: Said) -> str:
     """One sentence on what the effect does."""
+    if said.takes_back:
+        return "It is added to what the simulation has, so that less energy is taken out."
     return _DOES[said.one.effect.name](said)
 
 

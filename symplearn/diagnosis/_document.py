@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import truncnorm
 
 from .._effects import Candidate
 from .._recording import Recording
@@ -19,17 +20,27 @@ from ._weighed import Estimate
 # Alternatives listed one by one; the rest is `other`.
 _LISTED = 12
 _LEAST = 5e-4
+# A bound cuts what comes nearer to it than so many standard deviations.
+_FAR = 5.0
 
 
 def parameters(problem: Problem, priors: Priors, estimate: Estimate, inflation: float) -> dict[str, Any]:
-    """Posterior of everything calibrated, its middle as far as bounds allow."""
-    estimate = within_bounds(problem, priors, estimate)
-    part = slice(problem.head, problem.head + problem.calibrated.size)
-    sd = np.minimum(np.sqrt(np.diag(estimate.covariance)[part] * inflation), problem.calibrated.sd)
-    return {
-        name: {"mean": float(m), "sd": float(s)}
-        for name, m, s in zip(problem.calibrated.names, estimate.z[part], sd, strict=True)
-    }
+    """Posterior of everything calibrated, as far as bounds allow."""
+    c, part = problem.calibrated, slice(problem.head, problem.head + problem.calibrated.size)
+    z, within = estimate.z[part], within_bounds(problem, priors, estimate).z[part]
+    # One that is beyond its bounds is cut off there; the others have followed it.
+    mean = np.where((c.lower <= z) & (z <= c.upper), within, z)
+    sd = np.minimum(np.sqrt(np.diag(estimate.covariance)[part] * inflation), c.sd)
+    each = zip(c.names, mean, sd, c.lower, c.upper, strict=True)
+    return {name: _between(*map(float, values)) for name, *values in each}
+
+
+def _between(mean: float, sd: float, lower: float, upper: float) -> dict[str, float]:
+    """Mean and standard deviation of a Gaussian, or of its part between bounds where they cut it."""
+    if sd > 0 and min(mean - lower, upper - mean) < _FAR * sd:
+        law = truncnorm((lower - mean) / sd, (upper - mean) / sd, mean, sd)
+        mean, sd = float(law.mean()), float(law.std())
+    return {"mean": mean, "sd": sd}
 
 
 def fit(

@@ -136,15 +136,21 @@ def without_turns(problem: Problem, z: Float[np.ndarray, " z"]) -> Float[np.ndar
         begin = slice(r * problem.state, (r + 1) * problem.state)
         for i in range(problem.equations.dim):
             x = z[begin]
-            if np.isinf(problem.initial.sd[i]) and np.isfinite(x).all() and _is_unread_angle(problem, r, z, x, i):
-                z[begin.start + i] -= 2 * np.pi * np.round((x[i] - problem.initial.mean[i]) / (2 * np.pi))
+            if not np.isinf(problem.initial.sd[i]) or not np.isfinite(x).all():
+                continue
+            turns = 2 * np.pi * np.round((x[i] - problem.initial.mean[i]) / (2 * np.pi))
+            if turns and _is_unread_angle(problem, r, z, x, i, turns):
+                z[begin.start + i] -= turns
     return z
 
 
-def _is_unread_angle(problem: Problem, r: int, z: np.ndarray, x: np.ndarray, i: int) -> bool:
-    """Whether a whole turn of a coordinate changes neither what moves it nor what is read, at a point and off it."""
+def _is_unread_angle(problem: Problem, r: int, z: np.ndarray, x: np.ndarray, i: int, turns: float) -> bool:
+    """Whether whole turns of a coordinate change neither what moves it nor what is read, at a point and off it.
+
+    All at once: of a length of 1e11 m a single turn would be lost in rounding.
+    """
     points = np.stack([x, x + 0.3, x - 0.7])
-    turned = points + 2 * np.pi * (np.arange(len(x)) == i)
+    turned = points - turns * (np.arange(len(x)) == i)
     for what in (force, velocity, readings):
         here, there = (along(problem, what, r, z, (), some) for some in (points, turned))
         if not np.allclose(here, there, rtol=_ROUND_OFF, atol=_ROUND_OFF * np.abs(here).max()):

@@ -42,6 +42,13 @@ _OPENINGS = {
     "sensor_outliers": "Some readings of {q} are off by far more than the noise",
     "unnamed_force": "A force on {q} that has no name in the vocabulary was left out",
 }
+# Where a known term takes out too much: what is found is added to it, and negative.
+_TOO_STRONG = {
+    "viscous_damping": "The viscous damping of {q} that the simulation has is too strong",
+    "quadratic_drag": "The quadratic drag on {q} that the simulation has is too strong",
+    "coulomb_friction": "The dry friction on {q} that the simulation has is too strong",
+    "relative_damping": "The damping between {q} and {q2} that the simulation has is too strong",
+}
 # Plain words for an effect that a finding is hard to tell from.
 _NOUNS = {
     "viscous_damping": "a viscous damping",
@@ -104,7 +111,8 @@ def finding_sentence(
     - `only`: the recordings, from 1, that it is in; `None` for all.
     """
     said = Said(one, coefficients, units)
-    opening = _OPENINGS[one.effect.name].format(q=one.targets[0], q2=one.targets[-1], side=_side(one))
+    openings = _TOO_STRONG if said.takes_back else _OPENINGS
+    opening = openings[one.effect.name].format(q=one.targets[0], q2=one.targets[-1], side=_side(one))
     if one.nameless is not None and one.nameless.words:
         opening += f"; it {one.nameless.words}"
     words = [f"{opening}: {_law_with_numbers(said)}."]
