@@ -103,3 +103,14 @@ def test_a_fit_that_is_far_off_is_granted_nothing_for_them(steps_short, monkeypa
 
 def one_step(*arguments, **options):
     return grow(*arguments, **{**options, "final": 1})
+
+
+def test_outliers_that_the_file_knows_are_not_found_again():
+    """What augmented.toml says of one column is taken out there, and looked for in the other alone: of a buoy of the
+    eleventh exam they were told once more, with certainty."""
+    known = '[[terms]]\neffect = "sensor_outliers"\ntarget = "a"\ne = 0.04\nsd = 0.5\n'
+    file = cases.simulation("p**2/2 + q**2/2", observe={"a": "q", "b": "p"}, more=known)
+    swing = np.stack([np.cos(TIMES), -np.sin(TIMES)], axis=1)
+    p = cases.problem(file, [cases.recorded(TIMES, swing, columns=("a", "b"))], 0.25)
+    searched = [p.candidate(m).targets for m in p.searched if p.candidate(m).effect.name == "sensor_outliers"]
+    assert searched == [("b",)] and p.known_outliers == (0,)

@@ -126,18 +126,21 @@ def build(
             if c.effect.name in EFFECTS and restriction.allows(c) and _is_open(file, c)
         ),
         units=dict(file.units),
-        known_outliers=tuple(
-            j
-            for j, c in enumerate(built.columns)
-            if any(t.effect == OUTLIERS.name and t.target == (c,) for t in file.terms)
-        ),
+        known_outliers=tuple(j for j, c in enumerate(built.columns) if _has_outliers(file, c)),
     )
+
+
+def _has_outliers(file: SimulationFile, column: str) -> bool:
+    return any(term.effect == OUTLIERS.name and term.target == (column,) for term in file.terms)
 
 
 def _is_open(file: SimulationFile, candidate: Candidate) -> bool:
     """Whether the simulation leaves room for an effect: a noise can be wrong only where it is given, a parameter only
-    where it is known, and nothing multiplies a parameter that is zero."""
+    where it is known, and nothing multiplies a parameter that is zero. Outliers that the file knows of are taken out
+    whatever their share and size, and are none to be found."""
     (target, *_) = candidate.targets
+    if candidate.effect is OUTLIERS:
+        return not _has_outliers(file, target)
     if candidate.effect is NOISE:
         return target in file.recording.noise
     if candidate.effect.acts_on != PARAMETER:
