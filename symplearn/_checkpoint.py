@@ -6,7 +6,8 @@ import os
 import re
 import zipfile
 from pathlib import Path
-from typing import NamedTuple
+from types import CellType, CodeType, FunctionType
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -61,15 +62,39 @@ class Checkpoint(NamedTuple):
 
 
 def seal_of(parts: PyTree, settings: str) -> str:
-    """A digest of every leaf of `parts` with its place, of their structure, and of the settings in words."""
+    """A digest of every leaf of `parts` with its place, of their structure, and of the settings in words.
+
+    Of a function its instructions count, and what it has been given: two of one name may be two priors.
+    """
     leaves, structure = jax.tree_util.tree_flatten_with_path(parts)
     digest = hashlib.sha256(f"{settings} {_ADDRESS.sub('', str(structure))}".encode())
     for path, leaf in leaves:
         digest.update(jax.tree_util.keystr(path).encode())
         if not eqx.is_array(leaf):
-            digest.update(_ADDRESS.sub("", repr(leaf)).encode())
+            digest.update(_words_of(leaf, ()).encode())
             continue
-        plain = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        plain = _plain(leaf)
         digest.update(f"{plain.shape} {plain.dtype}".encode())
-        digest.update(np.asarray(plain).tobytes())
+        digest.update(plain.tobytes())
     return digest.hexdigest()
+
+
+def _plain(array: Any) -> np.ndarray:
+    """The numbers of an array, those behind it if it is of keys."""
+    return np.asarray(jax.random.key_data(array) if jnp.issubdtype(array.dtype, jax.dtypes.prng_key) else array)
+
+
+def _words_of(thing: Any, above: tuple[Any, ...]) -> str:
+    """What makes something another in writing; `above` are the functions that lead to it, which may hold themselves."""
+    if eqx.is_array(thing):
+        return f"{thing.dtype} {_plain(thing).tolist()}"
+    if isinstance(thing, tuple | list | dict):
+        return "".join(_words_of(one, above) for one in (thing.items() if isinstance(thing, dict) else thing))
+    if isinstance(thing, CodeType):
+        return thing.co_code.hex() + "".join(_words_of(one, above) for one in thing.co_consts)
+    if not isinstance(thing, FunctionType) or any(thing is one for one in above):
+        return _ADDRESS.sub("", repr(thing))
+    # A cell that is not filled yet is of a function that is still being made.
+    cells = [cell.cell_contents for cell in thing.__closure__ or () if cell != CellType()]
+    held = [thing.__code__, *(thing.__defaults__ or ()), *(thing.__kwdefaults__ or {}).values(), *cells]
+    return f"{thing.__module__}.{thing.__qualname__}" + "".join(_words_of(one, (*above, thing)) for one in held)

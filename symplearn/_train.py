@@ -243,10 +243,13 @@ def train(
     refuse_key(key)
     given = series if several else series[0]
     training = Training(objective, prior, optimiser, steps_of(objective, series))
-    settings = repr(optimiser) if isinstance(optimiser, AbstractOptimiser) else "optax"
     file = None
     if checkpoint is not None:
-        file = Checkpoint(Path(checkpoint), seal_of((model, given, objective, prior, key), f"{settings} {epochs}"))
+        settings, own = (
+            ("optax", optimiser) if not isinstance(optimiser, AbstractOptimiser) else (repr(optimiser), None)
+        )
+        seal = seal_of((model, given, objective, prior, key, own), f"{settings} {epochs}")
+        file = Checkpoint(Path(checkpoint), seal)
     state = run_epochs(
         lambda state, count: _advance(training, model, given, state, key, count), training.begin(model, epochs), file
     )

@@ -138,7 +138,8 @@ def diagnose_each(
             console.print(f"{printable(one.name)}: {said}", markup=False, highlight=False, soft_wrap=True)
             progress.say(f"{printable(one.name)} is done")
     if failed:
-        _leave(1, f"{failed} of {len(recordings)} recordings could not be diagnosed; the others' reports are in {out}")
+        rest = f"; the others' reports are in {out}" if failed < len(recordings) else ""
+        _leave(1, f"{failed} of {len(recordings)} recordings could not be diagnosed{rest}")
 
 
 def _check(holdout: float, time_limit: float | None) -> None:

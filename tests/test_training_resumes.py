@@ -11,6 +11,7 @@ import pytest
 
 import integrators as ig
 from symplearn import _train
+from symplearn._checkpoint import seal_of
 from symplearn._errors import InputError
 from symplearn._hamiltonian_objectives import MiniBatch, OneStepL1
 from symplearn._model import FullState, Gaussian, Propagator, StateSpaceModel
@@ -19,7 +20,7 @@ from symplearn._noise import AdditiveGaussian, ScaledIdentity
 from symplearn._objectives import AbstractObjective, MarginalLikelihood, TimeSeries
 from symplearn._optimisers import Adam, ByLeaf
 from symplearn._parameters import Positive
-from symplearn._prior import Flat, HalfNormal, Normal, Prior
+from symplearn._prior import Flat, HalfNormal, LogDensity, Normal, Prior
 
 N, DT = 24, 0.1
 PRIOR = Prior({"dynamics": Normal(0.0, 10.0), "process_noise": HalfNormal(1.0)})
@@ -130,6 +131,20 @@ class Walled(AbstractObjective):
 
     def score(self, model, series):
         return jnp.where(model.x > 1.0, 1e15, (model.x - 3.0) ** 2)
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda x: LogDensity(lambda v: -x * v**2),
+        lambda x: optax.sgd(x),
+        lambda x: optax.chain(optax.clip(1.0), optax.adam(optax.exponential_decay(x, 10, 0.9))),
+    ],
+    ids=["prior", "optax", "chain and schedule"],
+)
+def test_functions_are_told_apart_by_what_they_do(made):
+    """Two priors or optimisers of one name and other numbers belong to two trainings; the same, made anew, to one."""
+    assert seal_of(made(0.1), "") == seal_of(made(0.1), "") != seal_of(made(0.2), "")
 
 
 def test_failed_steps_are_counted_and_undone():
