@@ -58,7 +58,7 @@ def _check_rows(simulation: SimulationFile, recordings: Sequence[_Rows]) -> None
     unknown = simulation.unknowns + simulation.unknown_states * len(recordings)
     if rows < max(unknown, 1):
         raise InputError(
-            f"{_names(recordings)}: the rows used that have readings are {rows}, but {simulation.name} leaves "
+            f"{_names(recordings)}: {rows} rows with readings are used, but {simulation.name} leaves "
             f"{unknown} numbers unknown ({simulation.unknowns} parameters, {unknown - simulation.unknowns} "
             "initial states); give more rows"
         )
