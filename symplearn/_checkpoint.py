@@ -5,6 +5,8 @@ import io
 import os
 import re
 import zipfile
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from types import CellType, CodeType, FunctionType
 from typing import Any, NamedTuple
@@ -64,7 +66,8 @@ class Checkpoint(NamedTuple):
 def seal_of(parts: PyTree, settings: str) -> str:
     """A digest of every leaf of `parts` with its place, of their structure, and of the settings in words.
 
-    Of a function its instructions count, and what it has been given: two of one name may be two priors.
+    Of a function its instructions count, and what it holds: two of one name may be two priors. What a global name
+    stands for does not.
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(parts)
     digest = hashlib.sha256(f"{settings} {_ADDRESS.sub('', str(structure))}".encode())
@@ -85,16 +88,36 @@ def _plain(array: Any) -> np.ndarray:
 
 
 def _words_of(thing: Any, above: tuple[Any, ...]) -> str:
-    """What makes something another in writing; `above` are the functions that lead to it, which may hold themselves."""
-    if eqx.is_array(thing):
+    """What makes something another in writing; `above` are the functions that lead to it, which may hold themselves.
+
+    Pickles by value (cloudpickle) would not do: they may differ from process to process, and nothing would go on.
+    """
+    if eqx.is_array(thing) or isinstance(thing, np.ndarray):
         return f"{thing.dtype} {_plain(thing).tolist()}"
-    if isinstance(thing, tuple | list | dict):
-        return "".join(_words_of(one, above) for one in (thing.items() if isinstance(thing, dict) else thing))
-    if isinstance(thing, CodeType):
-        return thing.co_code.hex() + "".join(_words_of(one, above) for one in thing.co_consts)
-    if not isinstance(thing, FunctionType) or any(thing is one for one in above):
+    parts = _parts_of(thing)
+    if parts is None or any(thing is one for one in above):
         return _ADDRESS.sub("", repr(thing))
-    # A cell that is not filled yet is of a function that is still being made.
-    cells = [cell.cell_contents for cell in thing.__closure__ or () if cell != CellType()]
-    held = [thing.__code__, *(thing.__defaults__ or ()), *(thing.__kwdefaults__ or {}).values(), *cells]
-    return f"{thing.__module__}.{thing.__qualname__}" + "".join(_words_of(one, (*above, thing)) for one in held)
+    return f"{type(thing).__name__}({', '.join(_words_of(one, (*above, thing)) for one in parts)})"
+
+
+def _parts_of(thing: Any) -> Sequence[Any] | None:
+    """What something is made of that its own words may not tell."""
+    match thing:
+        case tuple() | list():
+            return thing
+        case dict():
+            return list(thing.items())
+        case frozenset() | set():
+            return sorted(map(repr, thing))  # its own order is another in each process
+        case eqx.Module():
+            return jax.tree.leaves(thing) + [str(jax.tree.structure(thing))]
+        case partial():
+            return thing.func, thing.args, thing.keywords
+        case CodeType():
+            return thing.co_code.hex(), thing.co_names, thing.co_consts
+        case FunctionType():
+            # A cell that is not filled yet is of a function that is still being made.
+            cells = [cell.cell_contents for cell in thing.__closure__ or () if cell != CellType()]
+            return thing.__qualname__, thing.__code__, thing.__defaults__, thing.__kwdefaults__, cells
+    inner = getattr(thing, "__wrapped__", None)  # of a function that jax.jit has taken
+    return None if inner is None else (inner,)

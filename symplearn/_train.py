@@ -245,10 +245,7 @@ def train(
     training = Training(objective, prior, optimiser, steps_of(objective, series))
     file = None
     if checkpoint is not None:
-        settings, own = (
-            ("optax", optimiser) if not isinstance(optimiser, AbstractOptimiser) else (repr(optimiser), None)
-        )
-        seal = seal_of((model, given, objective, prior, key, own), f"{settings} {epochs}")
+        seal = seal_of((model, given, objective, prior, key, optimiser), f"{epochs}")
         file = Checkpoint(Path(checkpoint), seal)
     state = run_epochs(
         lambda state, count: _advance(training, model, given, state, key, count), training.begin(model, epochs), file

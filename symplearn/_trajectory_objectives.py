@@ -56,13 +56,9 @@ class StartingAt(AbstractSegmentation):
     indices: tuple[int, ...] = eqx.field(static=True, converter=tuple)
 
     def __check_init__(self):
-        whole = all(is_count(index, 0) for index in self.indices)
-        if (
-            not whole
-            or self.indices[:1] != (0,)
-            or any(b <= a for a, b in zip(self.indices, self.indices[1:], strict=False))
-        ):
-            raise ValueError(f"`StartingAt` needs increasing whole numbers from 0 on, but was given {self.indices}.")
+        indices, whole = self.indices, all(is_count(index, 0) for index in self.indices)
+        if not whole or indices != tuple(sorted({0, *indices})):
+            raise ValueError(f"`StartingAt` needs whole, increasing indices from 0 on, but was given {indices}.")
 
     def starts(self, intervals: int) -> tuple[int, ...]:
         if self.indices[-1] >= intervals:

@@ -50,14 +50,15 @@ _WORDS = (
 )
 VOCABULARY: dict[str, Word] = {word.name: word for word in _WORDS}
 
+_ABOVE_ZERO: tuple[Callable[[float], bool], str] = (lambda value: value == 0, "be greater than zero")
 # What a coefficient may not be, besides negative where it is positive by convention.
 FORBIDDEN: dict[tuple[str, str], tuple[Callable[[float], bool], str]] = {
     ("self_excitation", "a"): (lambda value: value == 0, "be other than zero"),
-    ("periodic_forcing", "omega"): (lambda value: value == 0, "be greater than zero"),
-    ("parametric_modulation", "omega"): (lambda value: value == 0, "be greater than zero"),
-    ("hidden_oscillator", "omega"): (lambda value: value == 0, "be greater than zero"),
-    ("sensor_noise", "s"): (lambda value: value == 0, "be greater than zero"),
-    ("sensor_outliers", "sd"): (lambda value: value == 0, "be greater than zero"),
+    ("periodic_forcing", "omega"): _ABOVE_ZERO,
+    ("parametric_modulation", "omega"): _ABOVE_ZERO,
+    ("hidden_oscillator", "omega"): _ABOVE_ZERO,
+    ("sensor_noise", "s"): _ABOVE_ZERO,
+    ("sensor_outliers", "sd"): _ABOVE_ZERO,
     ("sensor_outliers", "e"): (lambda value: value > 1, "lie between 0 and 1"),
 }
 

@@ -77,7 +77,7 @@ def test_a_driven_model_is_forecast_with_its_inputs():
     ahead = forecast(driven, until=N - 1.0 + AHEAD, inputs=u[N - 1 :])
     for k in range(AHEAD):
         m = A @ m + B @ u[N - 1 + k]
-        np.testing.assert_allclose(ahead.state_means[k], m, atol=1e-12)
+        np.testing.assert_allclose(ahead.state_means[k], m, atol=1e-12)  # round-off of order one. Seen: 0
     with pytest.raises(InputError, match="give `inputs`"):
         forecast(driven, until=N - 1.0 + AHEAD)
     with pytest.raises(InputError, match=r"of shape \(7, input\)"):

@@ -219,5 +219,5 @@ def test_wrong_segments_are_one_clear_sentence():
         segment_starts(pendulum(None), blind, EverySteps(4))
     with pytest.raises(InputError, match="at least 1"):
         EverySteps(0)
-    with pytest.raises(ValueError, match="increasing whole numbers from 0"):
+    with pytest.raises(ValueError, match="increasing indices from 0"):
         StartingAt((0, 4, 4))

@@ -147,6 +147,13 @@ def test_functions_are_told_apart_by_what_they_do(made):
     assert seal_of(made(0.1), "") == seal_of(made(0.1), "") != seal_of(made(0.2), "")
 
 
+@pytest.mark.parametrize("wrapped", [lambda f: f, jax.jit, lambda f: functools.partial(f, 1.0)])
+def test_functions_that_call_others_are_told_apart(wrapped):
+    """A sine and a cosine have the same instructions, and other names in them."""
+    sine, cosine = (wrapped(lambda *v: jnp.sin(v[-1])), wrapped(lambda *v: jnp.cos(v[-1])))
+    assert seal_of(sine, "") != seal_of(cosine, "")
+
+
 def test_failed_steps_are_counted_and_undone():
     """Steps beyond the wall are counted, the model stays before it, and gets nearer than a step to it."""
     found = _train.train(

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import truncnorm
 
 from .._effects import Candidate
 from .._recording import Recording
@@ -22,6 +21,8 @@ _LISTED = 12
 _LEAST = 5e-4
 # A bound cuts what comes nearer to it than so many standard deviations.
 _FAR = 5.0
+# What is left of it is looked at so many widths from where it is highest, at so many nodes.
+_REACH, _NODES = 40.0, 200
 
 
 def parameters(problem: Problem, priors: Priors, estimate: Estimate, inflation: float) -> dict[str, Any]:
@@ -36,11 +37,20 @@ def parameters(problem: Problem, priors: Priors, estimate: Estimate, inflation: 
 
 
 def _between(mean: float, sd: float, lower: float, upper: float) -> dict[str, float]:
-    """Mean and standard deviation of a Gaussian, or of its part between bounds where they cut it."""
-    if sd > 0 and min(mean - lower, upper - mean) < _FAR * sd:
-        law = truncnorm((lower - mean) / sd, (upper - mean) / sd, mean, sd)
-        mean, sd = float(law.mean()), float(law.std())
-    return {"mean": mean, "sd": sd}
+    """Mean and standard deviation of a Gaussian, or of its part between bounds where they cut it.
+
+    By quadrature: far beyond a bound, and between close ones, SciPy's `truncnorm` has no standard deviation.
+    """
+    if not 0 < sd < np.inf or min(mean - lower, upper - mean) >= _FAR * sd:
+        return {"mean": mean, "sd": sd}
+    peak = min(max(mean, lower), upper)
+    width = sd / max(1.0, abs(peak - mean) / sd)  # beyond a bound the density falls off as an exponential
+    low, high = max(lower - peak, -_REACH * width), min(upper - peak, _REACH * width)
+    nodes, share = np.polynomial.legendre.leggauss(_NODES)
+    off = low + 0.5 * (high - low) * (nodes + 1.0)  # from the peak, so that none of a narrow part is lost in rounding
+    share = share * np.exp(-off * (0.5 * off + (peak - mean)) / sd**2)
+    middle = float(share @ off / share.sum())
+    return {"mean": peak + middle, "sd": float(np.sqrt(share @ (off - middle) ** 2 / share.sum()))}
 
 
 def fit(
