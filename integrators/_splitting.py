@@ -116,7 +116,16 @@ class MeanOfCopies(AbstractProjection):
 
 
 def _as_strength(omega: Any) -> Any:
-    return None if omega is None else as_parameter(omega)
+    if omega is None:
+        return None
+    strength = as_parameter(omega)
+    if (
+        isinstance(strength, jax.Array)
+        and not isinstance(strength, jax.core.Tracer)
+        and not jnp.all(jnp.isfinite(strength))
+    ):
+        raise ValueError(f"`Tao` needs a finite `omega`, or None for no binding, but was given {strength}.")
+    return strength
 
 
 class Tao(AbstractIntegrator):
@@ -133,6 +142,8 @@ class Tao(AbstractIntegrator):
     - `omega`: strength of the binding between the copies, in 1/time. Larger binds tighter, needs smaller dt. None for
       no binding, which takes a quarter less work: for copies that are joined again after a step.
     - `projection`: how a doubled state is read; `MeanOfCopies()`, or `FirstCopy()` for (5.18) as printed.
+
+    **Raises:** `ValueError` where `omega` is not finite.
     """
 
     omega: Float[Array, ""] | None = eqx.field(converter=_as_strength, default=20.0)

@@ -11,6 +11,7 @@ from jaxtyping import PRNGKeyArray
 
 from ._errors import InputError
 from ._fit import Estimate
+from ._keys import refuse_key
 from ._posterior import Posterior
 from ._sample import sample
 from ._sampler import AbstractSampler
@@ -94,8 +95,9 @@ def compare_samplers(estimate: Estimate, samplers: Sequence[AbstractSampler], *,
 
     **Raises:** `InputError` where no sampler is given, and as `sample`.
     """
-    if not samplers:
-        raise InputError("`compare_samplers` was given no samplers; give at least one.")
+    if not isinstance(samplers, Sequence) or not samplers:
+        raise InputError("`compare_samplers` needs a list of samplers, of at least one.")
+    refuse_key(key)
     timed = []
     for k, sampler in enumerate(samplers):
         print(f"comparing: {type(sampler).__name__}, {k + 1} of {len(samplers)}", file=sys.stderr, flush=True)

@@ -85,7 +85,7 @@ def diagnose_each(
     for outcome in place.outcomes(answered, [(question,) for _, question in todo]):
         name, question = todo[outcome.number]
         if outcome.failure is not None:
-            yield Answered(name, failure=outcome.failure)
+            yield _failed(out / name, outcome.failure)
             continue
         verdict, files = outcome.value
         folder = prepare_directory(out / name)
@@ -117,12 +117,20 @@ def _names(recordings: Sequence[Path]) -> list[str]:
         name = path.name
         for ending in _ENDINGS:
             name = name.removesuffix(ending)
-        if not name or name in names:
+        if not name.strip("."):
+            raise InputError(f"{shown(path, 200)}: its name makes no folder for its report; rename it")
+        if name in names:
             raise InputError(
                 f"{shown(path, 200)}: its report would be in the folder {shown(name)} as another's; rename it"
             )
         names.append(name)
     return names
+
+
+def _failed(folder: Path, failure: str) -> Answered:
+    """A failure, with a word on the answer to an earlier question that its folder may hold."""
+    earlier = "; the report in its folder is an earlier one" if (folder / "diagnosis.json").is_file() else ""
+    return Answered(folder.name, failure=failure + earlier)
 
 
 def _content(path: Path) -> bytes:

@@ -103,6 +103,7 @@ def fit(
     recordings = as_recordings(recording)
     series = recordings if isinstance(recording, list | tuple) else recordings[0]
     refuse_unlearnable(model, recordings, "fit")
+    objective.refuse(model, recordings)
     posterior, likelihood, slope = _at(model, series, objective, prior)
     # Another recording's nats may be added to the impossible one's.
     if not bool(jnp.isfinite(posterior)) or float(likelihood) <= 0.5 * IMPOSSIBLE:

@@ -19,8 +19,8 @@ from ._counts import refuse_count
 from ._errors import InputError
 from ._guard import guard
 from ._model import FullState, Propagator, StateSpaceModel
-from ._objectives import AbstractObjective, TimeSeries, as_recordings
-from ._parameters import resolve
+from ._objectives import AbstractObjective, TimeSeries, as_recordings, refuse_other_dimension, refuse_wrong_state
+from ._parameters import require, resolve
 from ._trajectory_objectives import bounded
 
 # Singular values below this share of the largest are round-off of features that are dependent.
@@ -75,6 +75,9 @@ class HamiltonianLeastSquares(AbstractObjective):
     variance: Any = eqx.field(converter=lambda variance: jnp.asarray(variance, dtype=float))
     derivative: AbstractDerivative = DIFFERENCES
 
+    def __check_init__(self):
+        require(self.variance > 0, "`HamiltonianLeastSquares` needs positive variances of the rates.")
+
     def score(self, model: StateSpaceModel, series: TimeSeries) -> Float[Array, ""]:
         system = _propagator(resolve(guard(model)), series).system
         targets = _targets(self.derivative, series)
@@ -96,8 +99,10 @@ def hamiltonian_least_squares(
 
     **Raises:** `InputError` where the recordings do not determine all coefficients.
     """
-    flat = resolve(hamiltonian)
-    parts = [_equations(flat, one, derivative) for one in as_recordings(recordings)]
+    flat, several = resolve(hamiltonian), as_recordings(recordings)
+    for one in several:
+        refuse_other_dimension(flat, one.readings.shape[1])
+    parts = [_equations(flat, one, derivative) for one in several]
     features, rates = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
     keep = ~np.isnan(rates)
     # Columns of unit length: the rank is then that of the terms, whatever their units.
@@ -118,7 +123,7 @@ class MiniBatch(eqx.Module):
     Give another key at each step of training: `eqx.tree_at(lambda o: o.batch.key, objective, key)` compiles nothing.
     """
 
-    size: int = eqx.field(static=True)
+    size: int = eqx.field(static=True, converter=lambda size: int(size) if isinstance(size, np.integer) else size)
     key: PRNGKeyArray | Array
 
     def __check_init__(self):
@@ -142,6 +147,9 @@ class OneStepL1(AbstractObjective):
 
     scale: Any = eqx.field(converter=lambda scale: jnp.asarray(scale, dtype=float))
     batch: MiniBatch | None = None
+
+    def __check_init__(self):
+        require(self.scale > 0, "`OneStepL1` needs a positive scale of its Laplace density.")
 
     def __call__(self, model: StateSpaceModel, recording: Any) -> Float[Array, ""]:
         """Minus the log density; a batch is drawn from the intervals of all recordings together."""
@@ -196,6 +204,7 @@ def _propagator(model: StateSpaceModel, series: TimeSeries) -> Propagator:
             f"This objective needs readings of the whole phase point [q, p], but the model reads "
             f"`{type(model.observation).__name__}` in {series.readings.shape[1]} channels; use `MarginalLikelihood`."
         )
+    refuse_wrong_state(model, series.readings.shape[1])
     return model.dynamics
 
 

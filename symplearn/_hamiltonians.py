@@ -65,15 +65,31 @@ class Monomials(AbstractBasis):
 MONOMIALS = Monomials()
 
 
+def _half_widths(box: Any) -> Any:
+    """As they can be compared and hashed."""
+    return float(box) if np.ndim(box) == 0 else tuple(float(width) for width in box)
+
+
 class Legendre(AbstractBasis):
     """Legendre polynomials of z / box, orthogonal on [-box, box]; better conditioned than monomials there.
 
     `box` is the half-width, one number for all variables or one for each.
+
+    **Raises:** `InputError` where a half-width is not positive, or there is not one for each variable.
     """
 
-    box: tuple[float, ...] | float = eqx.field(static=True, default=1.0)
+    box: tuple[float, ...] | float = eqx.field(static=True, default=1.0, converter=_half_widths)
+
+    def __check_init__(self):
+        if not np.all(np.asarray(self.box) > 0):
+            raise InputError(f"`Legendre` needs positive half-widths, but was given {self.box}.")
 
     def scales(self, variables: int) -> Float[Array, " variable"]:
+        if np.shape(self.box) not in ((), (variables,)):
+            raise InputError(
+                f"`Legendre` has {np.size(self.box)} half-widths, but the polynomial {variables} variables; give one "
+                "for each, or one for all."
+            )
         return jnp.broadcast_to(jnp.asarray(self.box, dtype=float), (variables,))
 
     def values(self, x: Float[Array, "*shape"], degree: int) -> list[Float[Array, "*shape"]]:
@@ -269,7 +285,7 @@ class PolynomialPotential(ig.AbstractSeparableHamiltonian):
     zeros if left out; `basis` - `Monomials()` or `Legendre(box)`. It prints as an equation.
 
     **Raises:** `InputError` where `dim` or `degree` is no whole number of at least 1, or there are not as many
-    coefficients as terms.
+    coefficients as terms, or as half-widths of the basis as variables.
     """
 
     dim: int = eqx.field(static=True)
@@ -280,6 +296,7 @@ class PolynomialPotential(ig.AbstractSeparableHamiltonian):
     def __init__(self, dim: int, degree: int, coefficients: Any = None, basis: AbstractBasis = MONOMIALS):
         self.dim, self.degree, self.basis = dim, degree, basis
         _refuse_counts(self)
+        basis.scales(dim)  # refuses a basis that is for another number of variables
         self.coefficients = _coefficients(coefficients, len(exponents(dim, degree)))
 
     @property
@@ -323,6 +340,7 @@ class Polynomial(ig.AbstractHamiltonian):
     def __init__(self, dim: int, degree: int, coefficients: Any = None, basis: AbstractBasis = MONOMIALS):
         self.dim, self.degree, self.basis = dim, degree, basis
         _refuse_counts(self)
+        basis.scales(2 * dim)
         self.coefficients = _coefficients(coefficients, len(exponents(2 * dim, degree)))
 
     @property

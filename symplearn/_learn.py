@@ -69,6 +69,7 @@ def learn(
     several = as_recordings(recordings)
     series = several if isinstance(recordings, list | tuple) else several[0]
     refuse_unlearnable(model, several, "learn")
+    objective.refuse(model, several)
     if key is not None:
         refuse_key(key)
     starts = _portfolio(model, several, key)

@@ -105,6 +105,9 @@ class AbstractObjective(eqx.Module):
     def score(self, model: Any, series: TimeSeries) -> Float[Array, ""]:
         """Minus the log density of one recording under a model whose `initial` is for that recording."""
 
+    def refuse(self, model: Any, recordings: tuple[TimeSeries, ...]) -> None:
+        """Refuse, with `InputError`, what a value makes impossible to score and compiled code could not say."""
+
     def __call__(self, model: Any, recording: Any) -> Float[Array, ""]:
         """Minus the log density of the recording, or of independent recordings in a list or tuple: their sum."""
         recordings = as_recordings(recording)
@@ -141,9 +144,16 @@ class MarginalLikelihood(AbstractObjective):
     def score(self, model: AbstractStateSpaceModel, series: TimeSeries) -> Float[Array, ""]:
         return -log_likelihood(*prepare(model, series), transform=self.transform, passage=self.passage)
 
+    def refuse(self, model: AbstractStateSpaceModel, recordings: tuple[TimeSeries, ...]) -> None:
+        if model.initial is None:
+            for series in recordings:
+                _refuse_unread(series.readings[0])
+
     def filter(self, model: AbstractStateSpaceModel, recording: Any) -> Filtered:
         """The filter's history behind the score of one recording."""
-        return _filter(model, as_time_series(recording), self)
+        series = as_time_series(recording)
+        self.refuse(model, (series,))
+        return _filter(model, series, self)
 
 
 @eqx.filter_jit
@@ -180,16 +190,21 @@ def refuse_wrong_state(model: Any, size: int) -> None:
     dynamics = getattr(model, "dynamics", None)
     if not isinstance(dynamics, Propagator):
         return
-    dim = getattr(getattr(dynamics.system, "hamiltonian", dynamics.system), "dim", None)
-    if isinstance(dim, int) and size != 2 * dim:
-        raise InputError(
-            f"The Hamiltonian is of {dim} degrees of freedom, so a phase point has {2 * dim} numbers, but the state "
-            f"has {size}; make `dim` half of it."
-        )
+    refuse_other_dimension(getattr(dynamics.system, "hamiltonian", dynamics.system), size)
     if size % 2:
         raise InputError(
             f"The size of the state is {size}, but a phase point has a momentum for each coordinate; where only some "
             "are read, say so by `observation=Coordinates(...)` and give `initial=Gaussian(mean, covariance)` of all."
+        )
+
+
+def refuse_other_dimension(hamiltonian: Any, size: int) -> None:
+    """Refuses, with `InputError`, a state whose size is not twice the Hamiltonian's `dim`, where that is known."""
+    dim = getattr(hamiltonian, "dim", None)
+    if isinstance(dim, int) and size != 2 * dim:
+        raise InputError(
+            f"The Hamiltonian is of {dim} degrees of freedom, so a phase point has {2 * dim} numbers, but the state "
+            f"has {size}; make `dim` half of it."
         )
 
 
@@ -217,7 +232,11 @@ def _given_first(model: Any, reading: Array, instant: Instant) -> Gaussian:
             "The model has no initial distribution, and its observation is not `FullState`; give it "
             "`initial=Gaussian(mean, covariance)`."
         )
-    if not isinstance(reading, jax.core.Tracer) and bool(jnp.any(jnp.isnan(reading))):
-        raise InputError("The first row has missing readings; give the model `initial=Gaussian(mean, covariance)`.")
+    _refuse_unread(reading)
     nothing = jnp.zeros((reading.shape[0], reading.shape[0]))
     return Gaussian(reading, model.read(Taylor(), reading, nothing, instant).covariance)
+
+
+def _refuse_unread(reading: Array) -> None:
+    if not isinstance(reading, jax.core.Tracer) and bool(jnp.any(jnp.isnan(reading))):
+        raise InputError("The first row has missing readings; give the model `initial=Gaussian(mean, covariance)`.")

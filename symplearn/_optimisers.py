@@ -34,7 +34,7 @@ class Adam(AbstractOptimiser):
     clip: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        if self.learning_rate <= 0 or self.factor <= 0 or not all(0 <= beta < 1 for beta in self.betas):
+        if not (self.learning_rate > 0 and self.factor > 0) or not all(0 <= beta < 1 for beta in self.betas):
             raise InputError(
                 f"`Adam` needs a positive learning rate and factor and betas in [0, 1), but was given "
                 f"{self.learning_rate}, {self.factor} and {self.betas}."

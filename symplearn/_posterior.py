@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from ._arviz import arviz, inference_data
 from ._convergence import Diagnostics, diagnose_draws, labels
-from ._errors import InputError
+from ._errors import InputError, shown
 from ._fit import Estimate
 from ._log_posterior import negative_log_posterior
 from ._model import AbstractStateSpaceModel
@@ -158,6 +158,8 @@ class Posterior:
     def save(self, path: str | Path) -> None:
         """Write the draws to a NetCDF file, which `load_posterior` and `arviz.from_netcdf` read. Needs h5netcdf."""
         path = Path(path)
+        if not path.parent.is_dir():
+            raise InputError(f"{shown(path, 200)}: there is no folder {shown(path.parent, 200)}; make it first")
         unfinished = path.with_name(f".{path.name}.{os.getpid()}")
         try:
             self.to_arviz().to_netcdf(str(unfinished))

@@ -52,6 +52,7 @@ class Normal(AbstractEntrywise):
 
     def __check_init__(self):
         require(self.variance > 0, "`Normal` needs a positive variance, its second number.")
+        require(jnp.isfinite(self.mean), "`Normal` needs a finite mean, its first number.")
 
     def log_density(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         return -0.5 * ((value - self.mean) ** 2 / self.variance + jnp.log(2 * math.pi * self.variance))
@@ -187,8 +188,8 @@ class Prior(eqx.Module):
     `joint`, if given, is a function of the model in plain arrays (see `resolve`) and multiplies the densities of the
     leaves by one of several together: it returns nats, as `LogDensity` does.
 
-    **Raises:** `InputError`, in `log_density`, where a leaf has no density, or one of another kind of value, or where a
-    name fits no leaf.
+    **Raises:** `InputError`, in `log_density`, where a leaf has no density, or one of another kind or number of values,
+    or where a name fits no leaf.
     """
 
     densities: dict[str, AbstractDensity]
@@ -210,7 +211,7 @@ class Prior(eqx.Module):
         for name, leaf in leaves.items():
             density = self.density_of(name)
             _require_suitable(name, leaf, density)
-            total += jnp.sum(density.log_density(value_of(leaf))) + log_jacobian_of(leaf)
+            total += jnp.sum(_parts(name, leaf, density)) + log_jacobian_of(leaf)
         return total if self.joint is None else total + jnp.sum(_no_nan(self.joint(resolve(guard(model)))))
 
     def density_of(self, name: str) -> AbstractDensity:
@@ -232,6 +233,23 @@ class Prior(eqx.Module):
 
 def _begins(name: str, start: str) -> bool:
     return start in ("", name) or name.startswith(start + ".")
+
+
+def _parts(name: str, leaf: Any, density: AbstractDensity) -> Array:
+    """The log density of a leaf. More numbers than the leaf has entries are refused: they would count entries twice."""
+    value = value_of(leaf)
+    if not isinstance(density, AbstractEntrywise):
+        return density.log_density(value)
+    try:
+        parts = density.log_density(value)
+    except (TypeError, ValueError):  # shapes that do not broadcast
+        parts = None
+    if parts is None or jnp.shape(parts) != jnp.shape(value):
+        raise InputError(
+            f"`{name}` has the shape {jnp.shape(value)}, which the numbers of its `{type(density).__name__}` do not "
+            "fit; give one number for all entries, or one for each."
+        )
+    return parts
 
 
 def _require_suitable(name: str, leaf: Any, density: AbstractDensity) -> None:

@@ -40,6 +40,7 @@ class Lasso(AbstractPenalty):
     max_sweeps: int = eqx.field(static=True, default=1000)
 
     def __check_init__(self):
+        refuse_count("Lasso", "max_sweeps", self.max_sweeps)
         if not self.weight >= 0:
             raise InputError(f"`Lasso` needs a weight of at least 0, but was given {self.weight}.")
 

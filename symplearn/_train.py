@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from ._blocks import Course, run_blocks
 from ._checkpoint import Checkpoint, seal_of
 from ._counts import refuse_count
-from ._errors import InputError
+from ._errors import InputError, shown
 from ._faults import IMPOSSIBLE
 from ._keys import refuse_key
 from ._objectives import AbstractObjective, TimeSeries, as_recordings
@@ -241,6 +241,14 @@ def train(
         raise InputError("Nothing in the model learns: every number is known or `Frozen`. Wrap one in `Positive`.")
     refuse_count("train", "epochs", epochs)
     refuse_key(key)
+    if not isinstance(optimiser, AbstractOptimiser | optax.GradientTransformation):
+        raise InputError(
+            f"`train` needs an optimiser, such as `Adam(0.05)` or a gradient transformation of optax, but was given "
+            f"{shown(optimiser)}."
+        )
+    objective.refuse(model, series)
+    if not any(bool(jnp.any(~jnp.isnan(one.readings))) for one in series):
+        raise InputError("All readings are missing, so there is nothing to train on; give a recording with readings.")
     given = series if several else series[0]
     training = Training(objective, prior, optimiser, steps_of(objective, series))
     file = None

@@ -19,7 +19,7 @@ from ._faults import IMPOSSIBLE
 from ._guard import guard
 from ._model import AbstractAffine, Gaussian, Instant, Interval, StateSpaceModel, intervals_between
 from ._objectives import AbstractObjective, TimeSeries, as_recordings, as_time_series, one_of
-from ._parameters import AbstractKnown, Learnt, resolve
+from ._parameters import AbstractKnown, Learnt, require, resolve
 from ._triangular import forward_substitution, semidefinite_cholesky
 
 
@@ -100,6 +100,9 @@ class GaussianContinuity(AbstractContinuity):
     """
 
     variance: Any = eqx.field(converter=lambda variance: jnp.asarray(variance, dtype=float))
+
+    def __check_init__(self):
+        require(self.variance > 0, "`GaussianContinuity` needs positive variances; `fit_constrained` closes the gaps.")
 
     def log_density(self, gaps: Float[Array, "gap state"]) -> Float[Array, " gap"]:
         return -0.5 * jnp.sum(gaps**2 / self.variance + jnp.log(2 * math.pi * self.variance), axis=1)

@@ -62,6 +62,26 @@ def test_another_question_is_no_kept_answer(command, tmp_path, monkeypatch):
     assert ran.out == "recording: It is said.\n" and len(asked) == 3 and asked[2] != asked[1]
 
 
+def test_a_failure_says_that_the_report_is_an_earlier_one(command, tmp_path, monkeypatch):
+    """A recording that fails now and was answered before keeps that report, and its line says that it is earlier."""
+    monkeypatch.setattr("symplearn._each_recording.answered", lambda question: ("Said.", {"diagnosis.json": b"{}"}))
+    simulation, recording = write_case(tmp_path)
+    asked = ("diagnose-each", simulation, recording, "--out", tmp_path / "out")
+    assert command(*asked).code == 0
+
+    def fail(question):
+        raise InputError("recording.csv: line 3: no number")
+
+    monkeypatch.setattr("symplearn._each_recording.answered", fail)
+    (tmp_path / "recording.csv").write_text("t,x_m\n")
+    ran = command(*asked)
+    assert ran.code == 1
+    assert (
+        ran.out == "recording: failed: recording.csv: line 3: no number; the report in its folder is an earlier one\n"
+    )
+    assert (tmp_path / "out" / "recording" / "diagnosis.json").read_bytes() == b"{}"
+
+
 def refused(scheduler, tell):
     raise InputError("--scheduler: no Dask scheduler answers at `tcp://localhost:1`; start one")
 
@@ -74,6 +94,7 @@ def test_wrong_use_is_one_line(command, tmp_path, monkeypatch):
     other.write_text("")
     for files, options, said in (
         ((simulation, recording, other), (), "would be in the folder `recording` as another's"),
+        ((simulation, tmp_path / "..csv"), (), "..csv`: its name makes no folder for its report; rename it"),
         ((simulation, tmp_path / "none.csv"), (), "none.csv: no such file"),
         ((recording, recording), (), "recording.csv"),
         ((simulation, recording), ("--scheduler", "nonsense"), "--scheduler: `nonsense` is no address"),

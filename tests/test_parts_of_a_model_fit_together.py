@@ -100,6 +100,17 @@ ODD = {
     "no dimension": (lambda: sl.Polynomial(0, 2), "`dim` of at least 1"),
     "not a number": (lambda: sl.Positive(np.nan), "given NaN or infinity"),
     "zero": (lambda: sl.Positive(0.0), "given 0 or less"),
+    "half-width of zero": (lambda: sl.Legendre(0.0), "positive half-widths, but was given 0.0"),
+    "half-widths of two": (
+        lambda: sl.PolynomialPotential(1, 2, basis=sl.Legendre([2.0, 3.0])),
+        "2 half-widths, but the polynomial 1 variables",
+    ),
+    "scale of zero": (lambda: sl.OneStepL1(0.0), "positive scale"),
+    "scale that is none": (lambda: sl.OneStepL1(np.nan), "positive scale"),
+    "variance of rates": (lambda: sl.HamiltonianLeastSquares(-1.0), "positive variances"),
+    "variance of gaps": (lambda: sl.GaussianContinuity(-1.0), "positive variances"),
+    "rate that is none": (lambda: sl.Adam(np.nan), "positive learning rate"),
+    "mean that is none": (lambda: sl.Normal(np.nan), "finite mean"),
 }
 
 
@@ -154,6 +165,7 @@ COUNTS = {
     "ForwardEuler": lambda n: sl.ForwardEuler(lambda x: x, substeps=n),
     "EverySteps": sl.EverySteps,
     "MiniBatch": lambda n: sl.MiniBatch(n, jax.random.key(0)),
+    "Lasso": lambda n: sl.Lasso(0.1, max_sweeps=n),
     "SequentialThresholding": lambda n: sl.SequentialThresholding(0.1, max_steps=n),
     "RandomWalk": lambda n: sl.RandomWalk(thin=n),
     "NUTS": lambda n: sl.NUTS(draws=n),
@@ -186,6 +198,53 @@ def test_verbs_refuse_counts_of_nothing(verb, given):
         VERBS[verb](given)
 
 
+PENDULUM = sl.StateSpaceModel(
+    sl.Propagator(sl.PolynomialPotential(1, 2, sl.Learnt(np.ones(2))), ig.Leapfrog()),
+    sl.FullState(),
+    sl.WienerIncrement(sl.ScaledIdentity(0.1, dim=2)),
+    sl.AdditiveGaussian(sl.ScaledIdentity(0.1, dim=2)),
+)
+WIDE = sl.TimeSeries(np.arange(5.0), np.ones((5, 4)))
+UNREAD = sl.TimeSeries(np.arange(5.0), np.array([[np.nan, 1.0], *[[1.0, 1.0]] * 4]))
+EMPTY = sl.TimeSeries(np.arange(5.0), np.full((5, 2), np.nan))
+TRAINING = {"prior": sl.Flat(), "epochs": 1, "key": jax.random.key(0)}
+
+
+RECORDED = {
+    "least squares": (lambda: sl.hamiltonian_least_squares(sl.Polynomial(1, 2), WIDE), "1 degrees of freedom"),
+    "objective": (lambda: sl.HamiltonianLeastSquares(1.0)(PENDULUM, WIDE), "1 degrees of freedom"),
+    "training": (
+        lambda: sl.train(PENDULUM, WIDE, sl.OneStepL1(1.0), optimiser=sl.Adam(), **TRAINING),
+        "1 degrees of freedom",
+    ),
+    "no readings": (
+        lambda: sl.train(PENDULUM, EMPTY, sl.OneStepL1(1.0), optimiser=sl.Adam(), **TRAINING),
+        "All readings are missing",
+    ),
+    "a rule's name": (
+        lambda: sl.train(PENDULUM, UNREAD, sl.OneStepL1(1.0), optimiser="adam", **TRAINING),
+        "needs an optimiser, .* given `adam`",
+    ),
+    "a start to fit": (lambda: sl.fit(PENDULUM, UNREAD, prior=sl.Flat()), "first row has missing readings"),
+    "a start to learn": (lambda: sl.learn(PENDULUM, UNREAD, prior=sl.Flat()), "first row has missing readings"),
+    "a start to filter": (lambda: sl.MarginalLikelihood().filter(PENDULUM, UNREAD), "first row has missing readings"),
+}
+
+
+@pytest.mark.parametrize("use, said", RECORDED.values(), ids=RECORDED.keys())
+def test_recordings_fit_the_model(use, said):
+    """A recording of other widths, without a first reading or without any is refused before anything is compiled."""
+    with pytest.raises(InputError, match=said):
+        use()
+
+
+def test_strengths_of_binding_are_numbers():
+    """Tao's copies are bound by a finite strength, or not at all."""
+    with pytest.raises(ValueError, match="`Tao` needs a finite `omega`"):
+        ig.Tao(np.nan)
+    assert ig.Tao(None).omega is None
+
+
 def test_integrators_count_whole_substeps():
     """Nor does the mechanics below take a fraction of a step."""
     with pytest.raises(ValueError, match="whole number from 1 up, but is 2.5"):
@@ -203,3 +262,7 @@ def test_recordings_keys_and_samplers_are_what_they_are():
     for wrong in ("NUTS", sl.NUTS):
         with pytest.raises(InputError, match="an object with its options"):
             sl.sample_density(lambda x: -x @ x, jnp.zeros(1), sampler=wrong, key=jax.random.key(0))
+    with pytest.raises(InputError, match="`compare_samplers` needs a list"):
+        sl.compare_samplers(None, sl.NUTS(), key=jax.random.key(0))
+    with pytest.raises(InputError, match="`jax.random.key"):
+        sl.compare_samplers(None, [sl.NUTS()], key=0)

@@ -132,3 +132,10 @@ def test_a_density_of_the_users_own_saves(tmp_path):
     np.testing.assert_array_equal(load_posterior(tmp_path / "own.nc").values["x"], posterior.values["x"])
     with pytest.raises(InputError, match="has no model"):
         posterior.models()
+
+
+def test_a_folder_that_is_not_there_is_said(posterior, tmp_path):
+    """A path without its folder is refused in a sentence, and nothing is made."""
+    with pytest.raises(InputError, match="there is no folder .*; make it first"):
+        posterior.save(tmp_path / "none" / "posterior.nc")
+    assert not list(tmp_path.iterdir())

@@ -322,6 +322,16 @@ def test_a_density_of_another_kind_is_refused():
         InverseWishart(4.0, np.ones(2))
 
 
+def test_a_density_of_other_entries_is_refused():
+    """Three means over two variances would count each entry several times, or fail: one for all, or one for each."""
+    two = linear(Diagonal(Positive([0.2, 0.3])))
+    for variances in (np.ones(3), np.ones((3, 1)), np.ones((2, 2))):
+        with pytest.raises(InputError, match=r"has the shape \(2,\), which the numbers of its `HalfNormal` do not fit"):
+            Prior(HalfNormal(variances)).log_density(two)
+    each = [float(Prior(HalfNormal(one)).log_density(two)) for one in (2.0, np.array([2.0, 2.0]))]
+    assert each[0] == each[1]
+
+
 @pytest.mark.slow
 def test_a_fit_stays_within_the_support():
     """Where BFGS tries values of density zero it turns round; at a border it stops, and says it is no MAP. No NaN."""

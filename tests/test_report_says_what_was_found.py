@@ -175,6 +175,17 @@ def test_an_unlikely_consistent_does_not_claim_agreement():
     assert "rules out neither" in html_report(dataclasses.replace(record, series=()))
 
 
+def test_a_loss_that_is_too_strong_was_not_left_out():
+    """Where a finding takes from a known loss, the headline says that there is too much of it."""
+    answer = cases.document()
+    answer["findings"][0]["coefficients"]["c"] |= {"mean": -0.0009, "interval95": [-0.00094, -0.00086]}
+    page = html_report(cases.damped_pendulum(document=answer, series=()))
+    assert "The simulation has too much viscous damping on theta (probability 93.1 %)." in page
+    answer["findings"].append({**answer["findings"][0], "effect": "constant_force", "coefficients": {}})
+    page = html_report(cases.damped_pendulum(document=answer, series=()))
+    assert "left something out or has too much: too much viscous damping on theta, constant force on theta" in page
+
+
 def test_unexplained_names_nothing():
     """Where no effect has the better of it, the page says that none does."""
     answer = cases.document() | {"verdict": "unexplained", "findings": []}

@@ -4,7 +4,7 @@ from typing import Any
 
 from ..diagnosis._record import Diagnosis
 from ._units import time_unit
-from ._words import combination, number, plain, probability
+from ._words import combination, number, plain, probability, takes_back
 
 PROBLEM = "The fit did not converge: the numbers here are where it stopped, not an answer to rely on."
 
@@ -20,7 +20,10 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
     if document["verdict"] == "unexplained":
         return f"The simulation and the recording differ, and no effect with a name explains it ({chance})."
     found = combination(document["findings"], recordings=len(diagnosis.series))
-    return f"The simulation left something out: {found} ({chance})."
+    less = [takes_back(one) for one in document["findings"]]
+    if all(less):
+        return f"The simulation has {found} ({chance})."
+    return f"The simulation left something out{' or has too much' if any(less) else ''}: {found} ({chance})."
 
 
 def where_and_when(diagnosis: Diagnosis) -> list[tuple[str, str]]:

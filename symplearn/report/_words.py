@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from .._effects import EFFECTS
 from .._errors import printable
 from .._vocabulary import COLUMN, PARAMETER, VOCABULARY
 
@@ -64,11 +65,20 @@ def side(finding: Mapping[str, Any]) -> str | None:
     return finding.get("side") or finding.get("coefficients", {}).get("side")
 
 
+def takes_back(finding: Mapping[str, Any]) -> bool:
+    """Whether it takes from a loss that a known term has too much of: losses are positive otherwise."""
+    known = EFFECTS.get(finding["effect"])
+    if known is None or known.family != "dissipation":
+        return False
+    first = (finding.get("coefficients") or {}).get(known.coefficients[0]) or {}
+    return (first.get("mean") or 0.0) < 0
+
+
 def effect(finding: Mapping[str, Any], recordings: int = 1) -> str:
     """`viscous damping on theta`: an effect and its target, in words; with its recordings where not in all."""
     name, places = plain(finding["effect"]), [plain(target) for target in targets(finding)]
     where = f"between {' and '.join(places)}" if len(places) > 1 else f"{_preposition(name)} {places[0]}"
-    which = f"{plain(side(finding))} " if side(finding) else ""
+    which = f"{plain(side(finding))} " if side(finding) else "too much " if takes_back(finding) else ""
     return f"{which}{name.replace('_', ' ')} {where}{_only(finding, recordings)}"
 
 
