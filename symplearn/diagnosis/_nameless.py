@@ -1,16 +1,13 @@
 """Forces without a name, weighed beside what was found with one: simple laws, and expressions of the missing force."""
 
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-import sympy
-from jaxtyping import Float
 
 from .._effects import UNNAMED, Nameless
 from .._recording import Recording
 from .._simulation_records import SimulationFile
-from ._build import augmented_equations, build
-from ._effect_priors import STRENGTH, with_nameless
+from ._extended import Extended
 from ._found import Found
 from ._laws import laws, priced
 from ._locate import strained_coordinates
@@ -18,10 +15,11 @@ from ._options import Options
 from ._outlook import Outlook
 from ._posterior import CONSISTENT, Posterior, posterior
 from ._problem import MOST, Combination
+from ._prospects import promising
 from ._score import Start
 from ._search import Search
-from ._trajectory import Stepper
-from ._unnamed import Proposal, along_path, proposals
+from ._shapes import Shapes
+from ._unnamed import Proposal, proposals
 from ._weighed import Estimate
 from ._weigher import KEPT
 
@@ -34,6 +32,8 @@ _BEHIND, _VAGUE, _MOST, _NEAR = 10.0, 0.3, 12, 8.0
 _BASES, _REACH = 2, 30.0
 # Second effects that are tried beside a law, at how many places each, and what they must promise.
 _BESIDE, _PLACES, _WORTH = 12, 60, 2.0
+# How many laws' shapes are moved, and how often.
+_SHAPED, _SHARPER = 2, 4
 # Remainders that are not weighed for every combination.
 _LATER = ("clock", "static", "force", "spell")
 
@@ -45,79 +45,37 @@ def weigh_nameless(file: SimulationFile, recordings: Sequence[Recording], option
     if not options.restriction.has(UNNAMED) or not search.in_time() or _odds(search).as_it_is >= CONSISTENT:
         return
     options.progress("weighing laws of force without a name")
-    taken = {file.coordinates.index(term.target[0]) for term in file.terms if term.effect == UNNAMED.name}
-    begun = _Extended(file, recordings, options, search)
-    if known := priced(begun.usable(laws(file), taken)):
-        begun.extend(known)
+    begun, outlooks = Extended(file, recordings, options, search), _outlooks(search)
+    shapes, plain = Shapes(file, outlooks), begun.usable(laws(file))
+    known = [*plain, *begun.usable(shapes.first())]
+    choices = len(plain) + len(shapes.families)
+    if known:
+        begun.extend(priced(known, choices))
         _weigh_laws(search, begun.members(len(known)))
-    pull = search.found.of(search.base, "force")
-    if pull is None or pull.intensity is None or not search.in_time() or not _is_open(_odds(search), search.found):
+        known = _sharpened(search, begun, shapes, known, choices)
+        _weigh_beside_laws(search, begun.members(len(known)))
+    if not outlooks or not search.in_time() or not _is_open(_odds(search), search.found):
         return
     options.progress("looking for an expression of the missing force")
-    outlooks = [Outlook(search.stepper, pull, r, pull.intensity) for r in range(len(recordings))]
-    if not all(o.ok for o in outlooks):
-        return
     some = proposals(file, outlooks, strained_coordinates(outlooks))[: MOST - len(search.base)]
-    usable = begun.usable([one.force for one in some], taken)
+    usable = begun.usable([one.force for one in some])
     if proposed := [one for one in some if one.force in usable]:
-        begun.extend([*known, *(one.force for one in proposed)])
+        begun.extend([*priced(known, choices), *(one.force for one in proposed)])
         _weigh_proposals(search, begun, proposed)
 
 
-class _Extended:
-    """The problem of a search with forces without a name behind its candidates."""
-
-    def __init__(self, file: SimulationFile, recordings: Sequence[Recording], options: Options, search: Search):
-        self.file, self.recordings, self.options, self.search = file, recordings, options, search
-
-    def usable(self, forces: Sequence[Nameless], taken: Container[int]) -> list[Nameless]:
-        """Those that are a number along the recorded motion, and somewhere not zero, on coordinates that are free."""
-        if not forces:
-            return []
-        scales = zip(forces, self._scales(forces), strict=True)
-        return [one for one, scale in scales if np.isfinite(scale).all() and not any(i in taken for i in one.places)]
-
-    def extend(self, forces: Sequence[Nameless]) -> None:
-        """Let the search go on with these, of which the first ones may be known to it."""
-        search, times = self.search, self.recordings[0].times
-        first, middle = float(times[0]), float(np.mean(times[[0, -1]]))
-        restriction, problem = self.options.restriction, search.problem
-        built = augmented_equations(self.file, first, restriction, middle, forces)
-        longest = float(np.max(problem.rows[0].spans.step)) * (1 + 1e-9)
-        problem = build(self.file, built, self.recordings, self.options.holdout, longest, restriction)
-        scales = [float(x) for each in self._scales(forces) for x in each]
-        search.goes_on(Stepper(problem, self.options.jobs), with_nameless(problem, search.found.priors, scales))
-
-    def members(self, number: int) -> range:
-        """Of the last so many forces that the search was extended by."""
-        every = len(self.search.problem.equations.candidates)
-        return range(every - number, every)
-
-    def _scales(self, forces: Sequence[Nameless]) -> list[Float[np.ndarray, " amplitude"]]:
-        """Prior scales of their amplitudes: as strong as every other effect where it is strongest."""
-        sizes = iter(self._sizes([term for force in forces for terms in force.pushes for term in terms]))
-        out = []
-        with np.errstate(divide="ignore"):
-            for force in forces:
-                each = [[self.search.typical[i] / next(sizes) for _ in terms]
-                        for i, terms in zip(force.places, force.pushes, strict=True)]  # fmt: skip
-                out.append(STRENGTH * np.min(each, axis=0))
-        return out
-
-    def _sizes(self, terms: Sequence[sympy.Expr]) -> Float[np.ndarray, " term"]:
-        """Root mean squares of terms along the motion that every prior of an effect comes from."""
-        problem, (z, paths), columns = self.search.problem, self.search.likely, []
-        d, width = len(self.file.coordinates), problem.equations.width
-        for r, (path, rows) in enumerate(zip(paths, problem.rows, strict=True)):
-            points = np.concatenate([path[:, :d], path[:, width : width + d]], axis=1)
-            fixed, n = problem.parameter_values(r, z)[: len(self.file.parameters)], len(path)
-            columns.append(along_path(self.file, terms, fixed, points, rows.inputs[:n], rows.times[:n]))
-        return np.sqrt((np.concatenate(columns) ** 2).mean(0))
+def _outlooks(search: Search) -> list[Outlook]:
+    """The force that the simulation without effects misses, by recording; none where it is not known."""
+    pull = search.found.of(search.base, "force")
+    if pull is None or pull.intensity is None or not search.in_time():
+        return []
+    outlooks = [Outlook(search.stepper, pull, r, pull.intensity) for r in range(len(search.problem.rows))]
+    return outlooks if all(o.ok for o in outlooks) else []
 
 
 def _weigh_laws(search: Search, members: Sequence[int]) -> None:
-    """Combinations of what was found and one law, from where regressions about the best ones put them; a second effect
-    beside the best law; and what is like the best of them beside every remainder."""
+    """Combinations of what was found and one law, from where regressions about the best ones put them, or alone; and
+    what is like the best of them beside every remainder."""
     found, near = search.found, _is_near(search)
     starts = _promising(search, members)
     alone = [s.combination for s in starts if len(s.combination) == len(search.base) + 1]
@@ -125,6 +83,15 @@ def _weigh_laws(search: Search, members: Sequence[int]) -> None:
         search.weigher.weigh([Start(c, search.from_seed(), 0.0) for c in alone])
     if starts:
         search.weigher.weigh(starts, whole=True)
+    if _is_open(_odds(search), found):  # what was found may hide what a law does alone
+        first = [s for s in promising(search.along(members), _REACH) if s.combination not in found.estimates]
+        search.weigher.weigh(first)
+    _weigh_beside_remainders(search, members)
+
+
+def _weigh_beside_laws(search: Search, members: Sequence[int]) -> None:
+    """A second effect beside the best answer, if that has a law."""
+    found = search.found
     best = max(found.estimates, key=found.odds)
     if set(best) & set(members) and len(best) < MOST and search.in_time():
         further = sorted(search.prospects.about(best, _PLACES), key=lambda s: -s.gain - found.prices.log(s.combination))
@@ -133,6 +100,50 @@ def _weigh_laws(search: Search, members: Sequence[int]) -> None:
             search.weigher.weigh(more, whole=True)
         search.refinement.weigh_subsets()
     _weigh_beside_remainders(search, members)
+
+
+def _sharpened(search: Search, begun: Extended, shapes: Shapes, known: list[Nameless], choices: int) -> list[Nameless]:
+    """Let the shapes of the best laws go where they do best; the laws that are known then, in their order."""
+    for _ in range(_SHARPER):
+        laws = [search.problem.candidate(member).nameless for _, member in _shaped(search, shapes)]
+        beside = [begun.usable([one for one in shapes.near(law) if one not in known]) for law in laws]
+        near = [one for some in beside for one in some]
+        if not near or not search.in_time():
+            break
+        known = list(dict.fromkeys([*known, *near]))
+        begun.extend(priced(known, choices))
+        first = begun.members(len(known)).start
+        starts = list[Start]()
+        for (c, member), some in zip(_shaped(search, shapes), beside, strict=True):
+            starts += _in_its_place(search, c, member, [first + known.index(one) for one in some])
+        search.weigher.weigh(starts, whole=True)
+        _weigh_beside_remainders(search, range(first, first + len(known)))
+    return known
+
+
+def _shaped(search: Search, shapes: Shapes) -> list[tuple[Combination, int]]:
+    """The best combinations that have a law with a shape, each of another one, and which member that is."""
+    found, chosen = search.found, dict[int, Combination]()
+    ranked = sorted(found.estimates, key=found.odds, reverse=True)
+    for c in ranked:
+        for m in c:
+            if shapes.near(found.problem.candidate(m).nameless) and found.odds(c) > found.odds(ranked[0]) - _REACH:
+                chosen.setdefault(m, c)
+    return [(c, law) for law, c in list(chosen.items())[:_SHAPED]]
+
+
+def _in_its_place(search: Search, combination: Combination, mine: int, members: Sequence[int]) -> list[Start]:
+    """A fitted combination with each of some laws in place of one, and each of them alone."""
+    problem, white = search.problem, search.found.of(combination, "white")
+    assert white is not None  # every combination is weighed under white noise first
+    values, starts = dict(problem.placed(combination)), list[Start]()
+    for new in (m + mine - problem.whole(mine) for m in members):
+        for c in {tuple(sorted({*combination, new} - {mine})), tuple(sorted((*search.base, new)))}:
+            z = np.where(np.arange(len(white.z)) < problem.slots, white.z, 0.0)
+            for m, place in problem.placed(c):
+                z[place] = white.z[values[mine if m == new else m]]
+            starts.append(Start(c, z, 0.0))
+    return starts
 
 
 def _promising(search: Search, members: Sequence[int]) -> list[Start]:
@@ -190,7 +201,7 @@ def _weigh_beside_remainders(search: Search, members: Sequence[int]) -> None:
     search.add_forces(near[:1], 2)
 
 
-def _weigh_proposals(search: Search, begun: _Extended, listed: Sequence[Proposal]) -> None:
+def _weigh_proposals(search: Search, begun: Extended, listed: Sequence[Proposal]) -> None:
     """All expressions together, alone and beside a missing force."""
     members = begun.members(len(listed))
     combination, z = tuple(sorted((*search.base, *members))), search.from_seed()

@@ -47,13 +47,14 @@ class Prospects:
             self._known[key] = [] if fits is None else self._scanned(fits, most)
         return self._known[key]
 
-    def along(self, path: PathFit, most: int) -> list[Start]:
-        """Starts of single effects about a path that a missing force bends."""
+    def along(self, path: PathFit, most: int, members: Sequence[int] | None = None) -> list[Start]:
+        """Starts of single effects about a path that a missing force bends: of all, or of some that have no place."""
         w = self.weigher
         if not np.isfinite(path.log_evidence):
             return []
+        units = self._units(most) if members is None else [Unit(m, None) for m in members]
         grams = on_path(w.stepper, path, w.rows)
-        return scan(w.problem, grams, path.z, w.base, w.found.priors, self._units(most))
+        return scan(w.problem, grams, path.z, w.base, w.found.priors, units)
 
     def exchanged(
         self, combination: Combination, most: int, size: int, number: int, beside: Estimate | None = None

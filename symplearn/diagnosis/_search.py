@@ -163,6 +163,10 @@ class Search:
             spread = np.ptp(np.stack(starts)[:, :head], axis=0) + 1e-300
             self.seed = min(starts, key=lambda z: float((((z - best.z)[:head] / spread) ** 2).sum()))
 
+    def along(self, members: Sequence[int]) -> list[Start]:
+        """Where each of some effects without a place begins alone, by the force that the simulation misses."""
+        return self.prospects.along(self._null, 1, members)
+
     @property
     def _null(self) -> PathFit:
         """The best path of the simulation without effects."""

@@ -1,0 +1,70 @@
+"""A problem that grows: forces without a name behind its candidates."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import sympy
+from jaxtyping import Float
+
+from .._effects import UNNAMED, Nameless
+from .._recording import Recording
+from .._simulation_records import SimulationFile
+from ._build import augmented_equations, build
+from ._effect_priors import STRENGTH, with_nameless
+from ._options import Options
+from ._search import Search
+from ._trajectory import Stepper
+from ._unnamed import along_path
+
+
+class Extended:
+    """The problem of a search with forces without a name behind its candidates."""
+
+    def __init__(self, file: SimulationFile, recordings: Sequence[Recording], options: Options, search: Search):
+        self.file, self.recordings, self.options, self.search = file, recordings, options, search
+        # Coordinates that a term of the file without a name pushes already.
+        self._taken = {file.coordinates.index(term.target[0]) for term in file.terms if term.effect == UNNAMED.name}
+
+    def usable(self, forces: Sequence[Nameless]) -> list[Nameless]:
+        """Those that are a number along the recorded motion, and somewhere not zero, on coordinates that are free."""
+        if not forces:
+            return []
+        scales = zip(forces, self._scales(forces), strict=True)
+        return [one for one, scale in scales if np.isfinite(scale).all() and self._taken.isdisjoint(one.places)]
+
+    def extend(self, forces: Sequence[Nameless]) -> None:
+        """Let the search go on with these, of which the first ones may be known to it."""
+        search, times = self.search, self.recordings[0].times
+        first, middle = float(times[0]), float(np.mean(times[[0, -1]]))
+        restriction, problem = self.options.restriction, search.problem
+        built = augmented_equations(self.file, first, restriction, middle, forces)
+        longest = float(np.max(problem.rows[0].spans.step)) * (1 + 1e-9)
+        problem = build(self.file, built, self.recordings, self.options.holdout, longest, restriction)
+        scales = [float(x) for each in self._scales(forces) for x in each]
+        search.goes_on(Stepper(problem, self.options.jobs), with_nameless(problem, search.found.priors, scales))
+
+    def members(self, number: int) -> range:
+        """Of the last so many forces that the search was extended by."""
+        every = len(self.search.problem.equations.candidates)
+        return range(every - number, every)
+
+    def _scales(self, forces: Sequence[Nameless]) -> list[Float[np.ndarray, " amplitude"]]:
+        """Prior scales of their amplitudes: as strong as every other effect where it is strongest."""
+        sizes = iter(self._sizes([term for force in forces for terms in force.pushes for term in terms]))
+        out = []
+        with np.errstate(divide="ignore"):
+            for force in forces:
+                each = [[self.search.typical[i] / next(sizes) for _ in terms]
+                        for i, terms in zip(force.places, force.pushes, strict=True)]  # fmt: skip
+                out.append(STRENGTH * np.min(each, axis=0))
+        return out
+
+    def _sizes(self, terms: Sequence[sympy.Expr]) -> Float[np.ndarray, " term"]:
+        """Root mean squares of terms along the motion that every prior of an effect comes from."""
+        problem, (z, paths), columns = self.search.problem, self.search.likely, []
+        d, width = len(self.file.coordinates), problem.equations.width
+        for r, (path, rows) in enumerate(zip(paths, problem.rows, strict=True)):
+            points = np.concatenate([path[:, :d], path[:, width : width + d]], axis=1)
+            fixed, n = problem.parameter_values(r, z)[: len(self.file.parameters)], len(path)
+            columns.append(along_path(self.file, terms, fixed, points, rows.inputs[:n], rows.times[:n]))
+        return np.sqrt((np.concatenate(columns) ** 2).mean(0))
