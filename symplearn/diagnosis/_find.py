@@ -1,10 +1,11 @@
 """From files to everything that was weighed: the problem laid out finely enough, searched, and searched again where
 no name fits."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from .._augmented import Equations
 from .._recording import Recording
 from .._simulation_records import SimulationFile
 from ._ahead import look_ahead
@@ -37,8 +38,8 @@ def searched(
     built = augmented_equations(file, first, options.restriction, middle)
     substep = first_substep(file, recordings)
 
-    def rebuild(longest: float) -> Problem:
-        return build(file, built, recordings, options.holdout, longest, options.restriction)
+    def rebuild(longest: float, equations: Equations = built) -> Problem:
+        return build(file, equations, recordings, options.holdout, longest, options.restriction)
 
     problem = rebuild(substep)
     check_fitted(file, problem, options.holdout)
@@ -52,21 +53,32 @@ def searched(
     finer, substep, is_fine = refined(rebuild, problem, seeds.z[0], noise, substep)
     stepper = stepper if finer is problem else Stepper(finer, options.jobs)
     search = _run(stepper, seeds.z, deadline, options)
-    found = search.found
-    best = max((e for es in found.estimates.values() for e in es), key=lambda e: e.log_evidence)
-    if np.isfinite(best.log_evidence):
-        # What lasts among the errors hides steps of some length, too: without it they would be no end too long.
-        finer, _, is_fine = refined(rebuild, finer, best.z, total_noise(best), substep, best.combination)
-        if finer is not stepper.problem:
-            options.progress("weighing the best combinations again in finer steps")
-            found = search.again(Stepper(finer, options.jobs))
+    steps = _refined(search, rebuild, (substep, is_fine), options)
     weigh_nameless(file, recordings, options, search)
+    if search.problem.equations is not built:  # a law may have a shape that passes faster than the motion
+        steps = _refined(search, lambda longest: rebuild(longest, search.problem.equations), steps, options)
     search.settle()
     found = search.found
     options.progress("comparing how well answers predict ahead")
     look_ahead(search.stepper, found, search.rows)
-    found.is_fine = is_fine
+    found.is_fine = steps[1]
     return found, search.stepper
+
+
+def _refined(
+    search: Search, rebuild: Callable[[float], Problem], steps: tuple[float, bool], options: Options
+) -> tuple[float, bool]:
+    """Weigh the best combinations again in finer steps, if the best one needs them: the longest substep then, and
+    whether it is fine enough."""
+    best = max((e for es in search.found.estimates.values() for e in es), key=lambda e: e.log_evidence)
+    if not np.isfinite(best.log_evidence):
+        return steps
+    # What lasts among the errors hides steps of some length, too: without it they would be no end too long.
+    finer, longest, is_fine = refined(rebuild, search.problem, best.z, total_noise(best), steps[0], best.combination)
+    if finer is not search.problem:
+        options.progress("weighing the best combinations again in finer steps")
+        search.again(Stepper(finer, options.jobs))
+    return longest, is_fine
 
 
 def _run(stepper: Stepper, seeds: np.ndarray, deadline: float, options: Options) -> Search:

@@ -1,5 +1,6 @@
 """Simple laws of force with a shape of their own, which the missing force shows: a knee, teeth, one place."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -20,7 +21,7 @@ _KNEES, _TEETH = np.geomspace(0.01, 1.0, 13), range(1, 25)
 _PLACES, _WIDTHS = np.linspace(0.05, 0.95, 19), np.geomspace(0.03, 0.25, 5)
 # Members of a family that are weighed first, so many steps apart, and what share of the missing force each must
 # explain, beside what a constant, the place and the speed do. What is smoothed shows the sharp ones too little.
-_FIRST, _APART, _EXPLAINED = 3, 3, 0.2
+_FIRST, _APART, _EXPLAINED = 3, 3, 0.05
 # Steps to the members that are tried about one.
 _STEPS = (-2, -1, 1, 2)
 # Forces that are the same but for round-off.
@@ -106,8 +107,8 @@ def _plain(file: SimulationFile, i: int) -> tuple[sympy.Expr, sympy.Expr, sympy.
 
 
 def _saturating(i: int, name: str, q: sympy.Expr, far: float) -> Family:
-    def law(rate: sympy.Float) -> Nameless:
-        words = f"goes with {name} and saturates from {float(1 / rate):.2g} on"
+    def law(rate: float) -> Nameless:
+        words = f"goes with {name} and saturates from {1 / rate:.2g} on"
         return Nameless((i,), ((-sympy.tanh(rate * q),),), words=words, kind="conservative")
 
     return _family({(k,): law(_rounded(1 / (share * far))) for k, share in enumerate(_KNEES)})
@@ -124,17 +125,18 @@ def _cogging(i: int, name: str, q: sympy.Expr) -> Family:
 def _at_one_place(i: int, name: str, q: sympy.Expr, v: sympy.Expr, low: float, high: float) -> list[Family]:
     """Brakes, and hollows."""
 
-    def brake(place: sympy.Float, width: sympy.Float) -> Nameless:
+    def brake(place: float, width: float) -> Nameless:
         words = f"goes with its speed, about {_where(name, place, width)}"
         return Nameless((i,), ((-_near(q, place, width) * v,),), words=words, kind="dissipation")
 
-    def hollow(place: sympy.Float, width: sympy.Float) -> Nameless:
+    def hollow(place: float, width: float) -> Nameless:
         words = f"comes from a hollow or a bump of the potential energy, about {_where(name, place, width)}"
         push = -_near(q, place, width) * (q - place)
         return Nameless((i,), ((push,),), words=words, kind="conservative")
 
-    def every(law: Callable[[sympy.Float, sympy.Float], Nameless]) -> Family:
-        places = [_rounded(low + share * (high - low)) for share in _PLACES]
+    def every(law: Callable[[float, float], Nameless]) -> Family:
+        digits = 2 - math.floor(math.log10(high - low))  # of the swing's hundredths, however far from zero it is
+        places = [round(low + share * (high - low), digits) for share in _PLACES]
         widths = [_rounded(share * (high - low)) for share in _WIDTHS]
         grid = product(enumerate(places), enumerate(widths))
         return _family({(a, b): law(place, width) for (a, place), (b, width) in grid})
@@ -142,17 +144,17 @@ def _at_one_place(i: int, name: str, q: sympy.Expr, v: sympy.Expr, low: float, h
     return [every(brake), every(hollow)]
 
 
-def _where(name: str, place: sympy.Float, width: sympy.Float) -> str:
-    return f"{name} = {float(place):g} alone, within {float(width):g}"
+def _where(name: str, place: float, width: float) -> str:
+    return f"{name} = {place} alone, within {width:g}"
 
 
-def _near(q: sympy.Expr, place: sympy.Float, width: sympy.Float) -> sympy.Expr:
+def _near(q: sympy.Expr, place: float, width: float) -> sympy.Expr:
     return sympy.exp(-_rounded(0.5 / width**2) * (q - place) ** 2)
 
 
-def _rounded(value: float) -> sympy.Float:
+def _rounded(value: float) -> float:
     """Two digits, which is how a law is told."""
-    return sympy.Float(float(f"{value:.2g}"))
+    return float(f"{value:.2g}")
 
 
 def _points(o: Outlook, d: int) -> Float[np.ndarray, "row two_d"]:
