@@ -99,8 +99,8 @@ def test_a_spring_that_saturates_is_no_unseen_oscillator():
 
 @pytest.mark.slow
 def test_teeth_are_counted():
-    """A rotor that a known torque turns to and fro and five teeth hold up, its sine and cosine read: the torque is told as one
-    that goes up and down five times a turn, with its size."""
+    """A rotor that a known torque turns to and fro and five teeth hold up, its sine and cosine read: the torque is told
+    as one that goes up and down five times a turn, with its size."""
     times = np.linspace(0.0, 40.0, 500)
     rates = lambda t, x: [x[1], np.cos(0.5 * t) - 0.1 * x[1] + 0.2 * np.cos(5 * x[0] - 0.7)]  # noqa: E731
     q = cases.solved(rates, [0.0, 0.5], times)[:, 0]
