@@ -47,6 +47,8 @@ class Equations:
     velocity: Callable[[Array], Array]
     softness: Callable[[Array], Array]  # d2H/dp_i2, by which a momentum turns into a velocity
     kick: Callable[[Array], Array] | None  # known forces that a velocity or momentum enters
+    parts: Callable[[Array], Array]  # what the known forces are sums of, end to end
+    pushed: tuple[int, ...]  # the coordinate of every part
     readings: Callable[[Array], Array]  # what the columns show without errors of their sensors
     impulses: Callable[[Array], Array]  # size and time of every known impulse, end to end
 
@@ -106,6 +108,8 @@ def equations(
     for one in candidates:
         for place, terms in zip(one.places, one.nameless.pushes if one.nameless else (), strict=False):
             forces[place] += sympy.Add(*(c[one.first + k] * term for k, term in enumerate(terms)))
+    parts = [(place, part) for place, force in enumerate(known.forces) for part in _summands(force)]
+    parts = parts or [(0, sympy.Integer(0))]
     still, driven = zip(*(f.as_independent(*momenta, as_Add=True) for f in forces), strict=True)
     every = [*parameters, *(one.symbol for one in known.further)]
     arguments = [*coordinates, *momenta, *every, *inputs, sympy.Symbol("t", real=True), *c]
@@ -133,9 +137,16 @@ def equations(
         velocity=compiled([derivative(known.hamiltonian, p) for p in momenta]),
         softness=compiled([derivative(derivative(known.hamiltonian, p), p) for p in momenta]),
         kick=compiled(driven) if any(f != 0 for f in driven) else None,
+        parts=compiled([part for _, part in parts]),
+        pushed=tuple(place for place, _ in parts),
         readings=compiled(list(known.readings.values())),
         impulses=compiled([value for _, size, when in known.impulses for value in (size, when)]),
     )
+
+
+def _summands(force: sympy.Expr) -> list[sympy.Expr]:
+    """What a force is a sum of, none of a force that is zero."""
+    return [part for part in sympy.Add.make_args(sympy.expand_mul(force)) if part != 0]
 
 
 def _potential(one: Candidate, coordinates: Sequence[sympy.Symbol]) -> sympy.Expr:

@@ -6,10 +6,8 @@ import pytest
 import sympy
 
 from symplearn.diagnosis import Options, diagnose
-from symplearn.diagnosis._build import Restriction, augmented_equations, build
-from symplearn.diagnosis._laws import laws, priced
-from symplearn.diagnosis._prices import Prices
-from symplearn.diagnosis._shapes import _at_one_place, _cogging, _saturating
+from symplearn.diagnosis._build import Restriction
+from symplearn.diagnosis._shapes import _cogging, _in_a_swing, _saturating
 
 Q, V = sympy.symbols("q v", real=True)
 FRICTION = ("viscous_damping", "quadratic_drag", "coulomb_friction", "unnamed_force")
@@ -25,22 +23,30 @@ def force(finding, **states):
     return float(sympy.sympify(finding["coefficients"]["expression"]).subs(states))
 
 
+def every(family):
+    """All laws of a family's grid."""
+    return [family.at(place) for place in family.places()]
+
+
 def test_shapes_are_what_their_words_say():
-    """A saturating force is half way at half its knee's tanh and flat beyond, teeth come back after a turn's part, and
-    what acts at one place is gone three widths off."""
-    for law in _saturating(0, "q", Q, 2.0).laws.values():
+    """A saturating force is half way at half its knee's tanh and flat beyond, teeth and waves come back after their
+    part of a turn or of the way, and what acts at one place is gone three widths off."""
+    for law in every(_saturating(0, "q", Q, 2.0)):
         knee, ((term,),) = float(law.words.split()[-2]), law.pushes
         # A rate of two digits is told as a knee of two digits.
         assert float(-term.subs(Q, knee)) == pytest.approx(np.tanh(1.0), abs=0.03)
         assert float(-term.subs(Q, 10 * knee)) == pytest.approx(1.0, abs=1e-6)
-    for law in _cogging(0, "q", Q).laws.values():
-        ((one, other),), n = law.pushes, int(law.words.split()[4])
-        for term in (one, other):
-            assert float(term.subs(Q, 0.3 + 2 * np.pi / n) - term.subs(Q, 0.3)) == pytest.approx(0.0, abs=1e-12)
+    waves, *at_one_place = _in_a_swing(0, "q", Q, V, -1.0, 1.0)
+    for law in every(waves) + every(_cogging(0, "q", Q)):
+        first, second = law.words.split()[4:6]
+        period = float(second) if first == "every" else 2 * np.pi / int(first)
+        for term in law.pushes[0]:
+            # Four digits of the period, half a unit in the last, are a phase of 2 pi * 5e-4.
+            assert float(term.subs(Q, 0.3 + period)) == pytest.approx(float(term.subs(Q, 0.3)), abs=0.0032)
     swings = [(-1.0, 1.0), (100.0, 100.3), (1e-9, 5e-8)]
-    for family in [family for swing in swings for family in _at_one_place(0, "q", Q, V, *swing)]:
-        assert len({law.words for law in family.laws.values()}) == len(family.laws)
-        for law in family.laws.values():
+    for family in [*at_one_place, *(one for swing in swings for one in _in_a_swing(0, "q", Q, V, *swing)[1:])]:
+        assert len({law.words for law in every(family)}) == len(family.places())
+        for law in every(family):
             place, width = (float(law.words.split(f" {word} ")[1].split()[0]) for word in ("=", "within"))
             ((term,),) = law.pushes
             near, far = (abs(float(term.subs({Q: place + k * width, V: 1.0}))) for k in (1.0, 4.0))
@@ -48,33 +54,27 @@ def test_shapes_are_what_their_words_say():
 
 
 def test_neighbours_are_next_to_a_law_and_first_ones_apart():
-    """About a law stand those one and two steps away along each axis of its family; the first ones to be tried are the
-    best, and at least three steps from each other."""
-    family = _at_one_place(0, "q", Q, V, -1.0, 1.0)[0]
-    places = {law.words: place for place, law in family.laws.items()}
-    for place in ((9, 2), (0, 0)):
-        steps = [np.abs(np.subtract(places[law.words], place)) for law in family.near(family.laws[place])]
-        assert all(sorted(step)[0] == 0 and step.max() in (1, 2) for step in steps)
-        assert len(steps) == (8 if place == (9, 2) else 4)
-    assert family.near(_cogging(0, "q", Q).laws[3,]) == []
-    shares = np.random.default_rng(0).uniform(0.0, 1.0, len(places))
-    first = [places[law.words] for law in family.first(shares)]
-    assert first[0] == list(family.laws)[int(np.argmax(shares))] and len(first) == 3
+    """About a law stand those so many steps away along each axis of its family, of teeth whole steps alone; the first
+    ones to be tried are the best, and at least three steps from each other."""
+    family, teeth = _in_a_swing(0, "q", Q, V, -1.0, 1.0)[1], _cogging(0, "q", Q)
+    for place, number in (((9.0, 2.0), 8), ((0.0, 0.0), 4), ((9.0, 3.5), 6)):
+        near = family.near(place, (2.0, 1.0))
+        steps = [np.abs(np.subtract(one, place)) for one, _ in near]
+        assert all(step.min() == 0 and step.max() in (1, 2) for step in steps) and len(near) == number
+    assert teeth.near((3.0,), (1.0, 0.5)) == [((2.0,), 1.0), ((4.0,), 1.0)]
+    shares = np.random.default_rng(0).uniform(0.0, 1.0, len(family.places()))
+    first = family.first(shares)
+    assert first[0] == family.places()[int(np.argmax(shares))] and len(first) == 3
     assert min(np.abs(np.subtract(a, b)).max() for a in first for b in first if a != b) >= 3
-    assert family.first(np.full(len(places), 0.1)) == []
+    assert family.first(np.full(len(shares), 0.01)) == []
 
 
 def test_a_family_is_one_choice():
-    """All shapes of a family together have the prior of one law without a shape."""
-    file, times = cases.simulation("p**2/2 + q**2/2"), np.linspace(0.0, 5.0, 30)
-    q, family = file.symbols["q"], list(_saturating(0, "q", file.symbols["q"], 1.0).laws.values())
-    assert q in family[0].pushes[0][0].free_symbols
-    every = priced([*laws(file), *family], len(laws(file)) + 1)
-    equations = augmented_equations(file, nameless=every)
-    problem = build(file, equations, [cases.recorded(times, np.cos(times))], 0.0, 0.1, Restriction())
-    number, prices = len(equations.candidates), Prices(problem)
-    price = np.exp([prices.log((m,)) for m in range(number - len(every), number)])
-    assert price[-len(family) :].sum() == pytest.approx(price[0])
+    """All shapes of a family together have as much of the prior on its grid as on one that is twice as fine."""
+    family = _saturating(0, "q", Q, 1.0)
+    for step in (1.0, 0.5):
+        places = [(k * step,) for k in range(round(len(family.places()) / step))]
+        assert sum(np.exp(-family.at(place, step).choices) for place in places) == pytest.approx(1.0)
 
 
 @pytest.mark.slow

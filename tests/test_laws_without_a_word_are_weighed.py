@@ -112,7 +112,7 @@ def test_laws_share_half_of_the_share_of_what_has_no_name():
     one."""
     file, times = two(), np.linspace(0.0, 5.0, 30)
     run = cases.recorded(times, np.cos(np.stack([times, times], axis=1)), columns=("a", "b"))
-    every = priced(laws(file), len(laws(file)))
+    every = priced(laws(file))
     problem = build(file, augmented_equations(file, nameless=every), [run], 0.0, 0.1, Restriction())
     members = range(len(problem.equations.candidates) - len(every), len(problem.equations.candidates))
     prices = Prices(problem)

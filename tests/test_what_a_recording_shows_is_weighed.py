@@ -59,7 +59,7 @@ def test_a_law_without_a_word_that_may_be_nothing_is_none():
     nothing; a word does in any case."""
     file = cases.simulation("(p1**2 + p2**2 + q1**2 + q2**2)/2", ["q1", "q2"], ["p1", "p2"], {"a": "q1"})
     recording, every = cases.recorded(np.arange(10.0), np.ones((10, 1)), columns=("a",)), Restriction()
-    built = augmented_equations(file, 0.0, every, 0.0, priced(laws(file), len(laws(file))))
+    built = augmented_equations(file, 0.0, every, 0.0, priced(laws(file)))
     p = build(file, built, [recording], 0.0, 1.0, every)
     law, word = (len(p.equations.candidates) - 1,), (place(p, "viscous_damping", "q1"),)
     for combination, size, is_weighed in ((law, 0.018, False), (law, 0.022, True), (word, 0.018, True)):

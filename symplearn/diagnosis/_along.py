@@ -27,6 +27,11 @@ def force(system: Simulated, x: Array, u: Array, t: Array) -> Array:
     return rates(system, x, u, t)[system.equations.width :]
 
 
+def parts(system: Simulated, x: Array, u: Array, t: Array) -> Array:
+    """What the known forces are sums of."""
+    return system.equations.parts(system.at(t, u).arguments(*ig.split(x)))
+
+
 def rates(system: Simulated, x: Array, u: Array, t: Array) -> Array:
     """The rate of change of the phase point, dry friction and impulses left out."""
     return system.at(t, u).rates(x)

@@ -40,10 +40,9 @@ def laws(file: SimulationFile) -> list[Nameless]:
     return listed
 
 
-def priced(listed: Sequence[Nameless], choices: int) -> list[Nameless]:
-    """The same, each of which is one choice of so many, or of a family that is: together they have a share of what has
-    no name."""
-    return [replace(law, choices=law.choices + float(np.log(choices / _SHARE))) for law in listed]
+def priced(listed: Sequence[Nameless]) -> list[Nameless]:
+    """The same, each of which is one choice of all: together they have a share of what has no name."""
+    return [replace(law, choices=float(np.log(len(listed) / _SHARE))) for law in listed]
 
 
 def _own(i: int, name: str, q: sympy.Expr, v: sympy.Expr) -> Iterator[Nameless]:

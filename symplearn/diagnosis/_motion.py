@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from ._along import along_all, force, readings, velocity
+from ._along import along_all, force, parts, readings, velocity
 from ._problem import Problem
 
 # Of a parameter's own size, for the derivative of a force that hangs on it smoothly.
@@ -68,15 +68,30 @@ class Motion:
 def motion_along(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarray, "_ state"]]) -> Motion:
     """The motion along given paths."""
     d = problem.equations.dim
-    v, push, shown = (along_all(problem, what, z, paths) for what in (velocity, force, readings))
+    v, push, each, shown = (along_all(problem, what, z, paths) for what in (velocity, force, parts, readings))
+    p, span = np.concatenate(paths)[:, problem.equations.momentum], max(np.ptp(r.times) for r in problem.rows)
+    own = [each[:, np.equal(problem.equations.pushed, i)] for i in range(d)]
     return Motion(
         q=np.concatenate([path[:, :d] for path in paths]),
         v=v[:, :d],
-        forces=np.array([rms(push[:, i]) for i in range(d)]),
+        forces=np.array([_there(push[:, i], own[i], rms(p[:, i]) / span) for i in range(d)]),
         levels=np.array([rms(column) for column in shown.T]),
         times=tuple(r.times[: len(path)] for r, path in zip(problem.rows, paths, strict=True)),
         stiffening=stiffening(problem, z, paths),
     )
+
+
+def _there(push: Float[np.ndarray, " row"], parts: Float[np.ndarray, "row part"], stop: float) -> float:
+    """How strong the forces on a coordinate are: that of the energy and the known others, which may hold each other, as
+    where a motor turns against its brake. Where there is none, what would stop the motion while it is recorded."""
+    apart = sum(_mean_square(one) for one in (push - parts.sum(1), *parts.T))
+    square = max(_mean_square(push), apart)
+    return float(np.sqrt(square)) if square > 0 else stop
+
+
+def _mean_square(values: Float[np.ndarray, " row"]) -> float:
+    square = values[np.isfinite(values)] ** 2
+    return float(square.mean()) if square.size else 0.0
 
 
 def stiffening(

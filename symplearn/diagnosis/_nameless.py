@@ -32,8 +32,8 @@ _BEHIND, _VAGUE, _MOST, _NEAR = 10.0, 0.3, 12, 8.0
 _BASES, _REACH = 2, 30.0
 # Second effects that are tried beside a law, at how many places each, and what they must promise.
 _BESIDE, _PLACES, _WORTH = 12, 60, 2.0
-# How many laws' shapes are moved, and how often.
-_SHAPED, _SHARPER = 2, 4
+# How many laws' shapes are moved, and by how many steps each time.
+_SHAPED, _SHARPER = 2, ((2.0, 1.0), (2.0, 1.0), (1.0, 0.5), (0.5, 0.25), (0.25,))
 # Remainders that are not weighed for every combination.
 _LATER = ("clock", "static", "force", "spell")
 
@@ -46,13 +46,12 @@ def weigh_nameless(file: SimulationFile, recordings: Sequence[Recording], option
         return
     options.progress("weighing laws of force without a name")
     begun, outlooks = Extended(file, recordings, options, search), _outlooks(search)
-    shapes, plain = Shapes(file, outlooks), begun.usable(laws(file))
-    known = [*plain, *begun.usable(shapes.first())]
-    choices = len(plain) + len(shapes.families)
+    shapes = Shapes(file, outlooks)
+    known = [*priced(begun.usable(laws(file))), *begun.usable(shapes.first())]
     if known:
-        begun.extend(priced(known, choices))
+        begun.extend(known)
         _weigh_laws(search, begun.members(len(known)))
-        known = _sharpened(search, begun, shapes, known, choices)
+        known = _sharpened(search, begun, shapes, known)
         _weigh_beside_laws(search, begun.members(len(known)))
     if not outlooks or not search.in_time() or not _is_open(_odds(search), search.found):
         return
@@ -60,7 +59,7 @@ def weigh_nameless(file: SimulationFile, recordings: Sequence[Recording], option
     some = proposals(file, outlooks, strained_coordinates(outlooks))[: MOST - len(search.base)]
     usable = begun.usable([one.force for one in some])
     if proposed := [one for one in some if one.force in usable]:
-        begun.extend([*priced(known, choices), *(one.force for one in proposed)])
+        begun.extend([*known, *(one.force for one in proposed)])
         _weigh_proposals(search, begun, proposed)
 
 
@@ -102,16 +101,15 @@ def _weigh_beside_laws(search: Search, members: Sequence[int]) -> None:
     _weigh_beside_remainders(search, members)
 
 
-def _sharpened(search: Search, begun: Extended, shapes: Shapes, known: list[Nameless], choices: int) -> list[Nameless]:
+def _sharpened(search: Search, begun: Extended, shapes: Shapes, known: list[Nameless]) -> list[Nameless]:
     """Let the shapes of the best laws go where they do best; the laws that are known then, in their order."""
-    for _ in range(_SHARPER):
+    for steps in _SHARPER:
         laws = [search.problem.candidate(member).nameless for _, member in _shaped(search, shapes)]
-        beside = [begun.usable([one for one in shapes.near(law) if one not in known]) for law in laws]
-        near = [one for some in beside for one in some]
-        if not near or not search.in_time():
-            break
-        known = list(dict.fromkeys([*known, *near]))
-        begun.extend(priced(known, choices))
+        beside = [begun.usable(shapes.near(law, steps)) for law in laws if law]
+        if not any(beside) or not search.in_time():
+            continue
+        known = [*known, *(one for some in beside for one in some)]
+        begun.extend(known)
         first = begun.members(len(known)).start
         starts = list[Start]()
         for (c, member), some in zip(_shaped(search, shapes), beside, strict=True):
@@ -127,7 +125,7 @@ def _shaped(search: Search, shapes: Shapes) -> list[tuple[Combination, int]]:
     ranked = sorted(found.estimates, key=found.odds, reverse=True)
     for c in ranked:
         for m in c:
-            if shapes.near(found.problem.candidate(m).nameless) and found.odds(c) > found.odds(ranked[0]) - _REACH:
+            if shapes.has(found.problem.candidate(m).nameless) and found.odds(c) > found.odds(ranked[0]) - _REACH:
                 chosen.setdefault(m, c)
     return [(c, law) for law, c in list(chosen.items())[:_SHAPED]]
 

@@ -1,7 +1,7 @@
 """Simple laws of force with a shape of their own, which the missing force shows: a knee, teeth, one place."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -16,75 +16,108 @@ from ._along import along, force
 from ._outlook import Outlook
 from ._unnamed import along_path
 
-# Knees, as shares of how far the coordinate goes; teeth in a turn; places of the swing and widths, as shares of it.
-_KNEES, _TEETH = np.geomspace(0.01, 1.0, 13), range(1, 25)
+# Knees, as shares of how far the coordinate goes; teeth in a turn, or waves in a swing; places of the swing and widths,
+# as shares of it.
+_KNEES, _TEETH, _WAVES = np.geomspace(0.01, 1.0, 13), np.arange(1.0, 25.0), np.arange(2.0, 24.0, 0.2)
 _PLACES, _WIDTHS = np.linspace(0.05, 0.95, 19), np.geomspace(0.03, 0.25, 5)
 # Members of a family that are weighed first, so many steps apart, and what share of the missing force each must
 # explain, beside what a constant, the place and the speed do. What is smoothed shows the sharp ones too little.
 _FIRST, _APART, _EXPLAINED = 3, 3, 0.05
-# Steps to the members that are tried about one.
-_STEPS = (-2, -1, 1, 2)
+# Share of the prior of what has no name that all families have, beside that of simple laws.
+_SHARE = 0.25
 # Forces that are the same but for round-off.
 _SAME = 1e-9
 
+Place = tuple[float, ...]
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Family:
-    """Laws on one coordinate that differ in nothing but their shape, by their places on a grid."""
+    """Laws on one coordinate that differ in nothing but their shape: the numbers that `law` takes, each from an axis.
 
-    laws: dict[tuple[int, ...], Nameless]
+    A place is one index for each axis, between two of which shapes are interpolated, unless the numbers are `counts`.
+    """
 
-    def first(self, shares: Float[np.ndarray, " law"]) -> list[Nameless]:
-        """Those that explain most, some steps apart."""
-        chosen: list[tuple[int, ...]] = []
-        ranked = [list(self.laws)[k] for k in np.argsort(-shares) if shares[k] > _EXPLAINED]
-        for place in ranked:
+    law: Callable[..., Nameless]
+    axes: tuple[Float[np.ndarray, " _"], ...]
+    counts: bool = False
+
+    def places(self) -> list[Place]:
+        """Of the grid."""
+        return [tuple(map(float, place)) for place in product(*(range(len(axis)) for axis in self.axes))]
+
+    def at(self, place: Place, step: float = 1.0) -> Nameless:
+        """One law, chosen from as many as there are that far apart."""
+        shape = [float(np.interp(x, np.arange(len(axis)), axis)) for x, axis in zip(place, self.axes, strict=True)]
+        return replace(self.law(*shape), choices=float(sum(np.log(len(axis) / step) for axis in self.axes)))
+
+    def first(self, shares: Float[np.ndarray, " place"]) -> list[Place]:
+        """Those of the grid that explain most, some steps apart."""
+        chosen, every = list[Place](), self.places()
+        for place in (every[k] for k in np.argsort(-shares) if shares[k] > _EXPLAINED):
             if len(chosen) < _FIRST and all(np.max(np.abs(np.subtract(place, one))) >= _APART for one in chosen):
                 chosen.append(place)
-        return [self.laws[place] for place in chosen]
+        return chosen
 
-    def near(self, law: Nameless) -> list[Nameless]:
-        """Those next to one, along each axis of the grid; none where it is of another family."""
-        place = next((place for place, one in self.laws.items() if one.words == law.words), None)
-        if place is None:
-            return []
-        steps = [step * np.eye(len(place), dtype=int)[axis] for axis in range(len(place)) for step in _STEPS]
-        moved = [tuple(int(x) for x in place + step) for step in steps]
-        return [self.laws[one] for one in moved if one in self.laws]
+    def near(self, place: Place, steps: Sequence[float]) -> list[tuple[Place, float]]:
+        """Those so many steps away along each axis, with the step."""
+        out = list[tuple[Place, float]]()
+        for axis, step, sign in product(range(len(place)), steps, (-1, 1)):
+            moved = tuple(x + sign * step * (k == axis) for k, x in enumerate(place))
+            if 0 <= moved[axis] <= len(self.axes[axis]) - 1 and (step >= 1 or not self.counts):
+                out.append((moved, min(step, 1.0)))
+        return out
 
 
 class Shapes:
-    """What families of laws a motion bounds; `outlooks`, one a recording, are of the simulation without effects."""
+    """What families of laws a motion bounds, each one choice of all. `outlooks`, one a recording, are of the simulation
+    without effects."""
 
     def __init__(self, file: SimulationFile, outlooks: Sequence[Outlook]):
         self.file, self.outlooks = file, outlooks
         self._points = [_points(o, len(file.coordinates)) for o in outlooks]
-        self.families = self._families() if outlooks else []
+        self._families = dict(self._on_each()) if outlooks else {}
+        self._made: dict[str, tuple[Family, Place]] = {}
 
     def first(self) -> list[Nameless]:
         """Of each family the laws whose shapes explain most of the missing force."""
         out = list[Nameless]()
-        for family in self.families:
-            laws = list(family.laws.values())
-            (i,) = laws[0].places
+        for family, i in self._families.items():
+            laws = [family.at(place) for place in family.places()]
             missing = np.concatenate([o.missing_force()[:, i] for o in self.outlooks])
             plain, shapes = self._values(_plain(self.file, i)), self._values([t for law in laws for t in law.pushes[0]])
-            out += family.first(_explained(plain, shapes.reshape(len(shapes), len(laws), -1), missing))
+            shares = _explained(plain, shapes.reshape(len(shapes), len(laws), -1), missing)
+            out += self._new(family, [(place, 1.0) for place in family.first(shares)])
         return out
 
-    def near(self, law: Nameless | None) -> list[Nameless]:
-        """Laws of the same family with shapes next to this one's; none of what has no family."""
-        return [] if law is None else [one for family in self.families for one in family.near(law)]
+    def has(self, law: Nameless | None) -> bool:
+        """Whether a law is of one of the families."""
+        return law is not None and law.words in self._made
 
-    def _families(self) -> list[Family]:
+    def near(self, law: Nameless, steps: Sequence[float]) -> list[Nameless]:
+        """Laws of the same family so many steps away that were not told before."""
+        family, place = self._made[law.words]
+        return self._new(family, family.near(place, steps))
+
+    def _new(self, family: Family, listed: Iterable[tuple[Place, float]]) -> list[Nameless]:
+        out = list[Nameless]()
+        for place, step in listed:
+            law = family.at(place, step)
+            law = replace(law, choices=law.choices + float(np.log(len(self._families) / _SHARE)))
+            if law.words not in self._made:
+                self._made[law.words] = family, place
+                out.append(law)
+        return out
+
+    def _on_each(self) -> Iterator[tuple[Family, int]]:
+        """Families, and which coordinate they are on."""
         points, turning = np.concatenate(self._points), _turning(self.outlooks[0], self._points[0])
-        out = list[Family]()
         for i, name in enumerate(self.file.coordinates):
             (_, q, v), low, high = _plain(self.file, i), float(points[:, i].min()), float(points[:, i].max())
             if low < high:
-                out.append(_saturating(i, name, q, max(-low, high)))
-                out += [_cogging(i, name, q)] if turning[i] else _at_one_place(i, name, q, v, low, high)
-        return out
+                some = [_saturating(i, name, q, max(-low, high))]
+                some += [_cogging(i, name, q)] if turning[i] else _in_a_swing(i, name, q, v, low, high)
+                yield from ((family, i) for family in some)
 
     def _values(self, terms: Iterable[sympy.Expr]) -> Float[np.ndarray, "row term"]:
         """Terms along the smoothed motion of all recordings."""
@@ -95,11 +128,6 @@ class Shapes:
         return np.concatenate(columns)
 
 
-def _family(laws: dict[tuple[int, ...], Nameless]) -> Family:
-    """Each member is chosen from all of them."""
-    return Family({place: replace(law, choices=float(np.log(len(laws)))) for place, law in laws.items()})
-
-
 def _plain(file: SimulationFile, i: int) -> tuple[sympy.Expr, sympy.Expr, sympy.Expr]:
     """What hides no shape: a constant, the place and the speed."""
     states = file.symbols
@@ -107,54 +135,54 @@ def _plain(file: SimulationFile, i: int) -> tuple[sympy.Expr, sympy.Expr, sympy.
 
 
 def _saturating(i: int, name: str, q: sympy.Expr, far: float) -> Family:
-    def law(rate: float) -> Nameless:
+    def law(share: float) -> Nameless:
+        rate = _rounded(1 / (share * far), 2)
         words = f"goes with {name} and saturates from {1 / rate:.2g} on"
         return Nameless((i,), ((-sympy.tanh(rate * q),),), words=words, kind="conservative")
 
-    return _family({(k,): law(_rounded(1 / (share * far))) for k, share in enumerate(_KNEES)})
+    return Family(law, (_KNEES,))
 
 
 def _cogging(i: int, name: str, q: sympy.Expr) -> Family:
-    def law(n: int) -> Nameless:
+    def law(teeth: float) -> Nameless:
+        n = round(teeth)
         words = f"goes up and down {n} times in a turn of {name}, as where teeth cog"
         return Nameless((i,), ((sympy.cos(n * q), sympy.sin(n * q)),), words=words, kind="conservative")
 
-    return _family({(n,): law(n) for n in _TEETH})
+    return Family(law, (_TEETH,), counts=True)
 
 
-def _at_one_place(i: int, name: str, q: sympy.Expr, v: sympy.Expr, low: float, high: float) -> list[Family]:
-    """Brakes, and hollows."""
+def _in_a_swing(i: int, name: str, q: sympy.Expr, v: sympy.Expr, low: float, high: float) -> list[Family]:
+    """Waves, a brake, and a hollow."""
+    span = high - low
+    digits = 2 - math.floor(math.log10(span))  # of the swing's hundredths, however far from zero it is
 
-    def brake(place: float, width: float) -> Nameless:
-        words = f"goes with its speed, about {_where(name, place, width)}"
-        return Nameless((i,), ((-_near(q, place, width) * v,),), words=words, kind="dissipation")
+    def wave(number: float) -> Nameless:
+        k = _rounded(2 * np.pi * number / span, 4)
+        words = f"goes up and down every {2 * np.pi / k:.4g} of {name}, as where teeth cog"
+        return Nameless((i,), ((sympy.cos(k * q), sympy.sin(k * q)),), words=words, kind="conservative")
 
-    def hollow(place: float, width: float) -> Nameless:
-        words = f"comes from a hollow or a bump of the potential energy, about {_where(name, place, width)}"
-        push = -_near(q, place, width) * (q - place)
-        return Nameless((i,), ((push,),), words=words, kind="conservative")
+    def brake(share: float, wide: float) -> Nameless:
+        near, apart, where = about(share, wide)
+        return Nameless((i,), ((-near * v,),), words=f"goes with its speed, {where}", kind="dissipation")
 
-    def every(law: Callable[[float, float], Nameless]) -> Family:
-        digits = 2 - math.floor(math.log10(high - low))  # of the swing's hundredths, however far from zero it is
-        places = [round(low + share * (high - low), digits) for share in _PLACES]
-        widths = [_rounded(share * (high - low)) for share in _WIDTHS]
-        grid = product(enumerate(places), enumerate(widths))
-        return _family({(a, b): law(place, width) for (a, place), (b, width) in grid})
+    def hollow(share: float, wide: float) -> Nameless:
+        near, apart, where = about(share, wide)
+        words = f"comes from a hollow or a bump of the potential energy, {where}"
+        return Nameless((i,), ((-near * apart,),), words=words, kind="conservative")
 
-    return [every(brake), every(hollow)]
+    def about(share: float, wide: float) -> tuple[sympy.Expr, sympy.Expr, str]:
+        place, width = round(low + share * span, digits), _rounded(wide * span, 2)
+        apart = q - place
+        near = sympy.exp(-_rounded(0.5 / width**2, 2) * apart**2)
+        return near, apart, f"about {name} = {place} alone, within {width:g}"
 
-
-def _where(name: str, place: float, width: float) -> str:
-    return f"{name} = {place} alone, within {width:g}"
-
-
-def _near(q: sympy.Expr, place: float, width: float) -> sympy.Expr:
-    return sympy.exp(-_rounded(0.5 / width**2) * (q - place) ** 2)
+    return [Family(wave, (_WAVES,)), Family(brake, (_PLACES, _WIDTHS)), Family(hollow, (_PLACES, _WIDTHS))]
 
 
-def _rounded(value: float) -> float:
-    """Two digits, which is how a law is told."""
-    return float(f"{value:.2g}")
+def _rounded(value: float, digits: int) -> float:
+    """As a law is told."""
+    return float(f"{value:.{digits}g}")
 
 
 def _points(o: Outlook, d: int) -> Float[np.ndarray, "row two_d"]:
