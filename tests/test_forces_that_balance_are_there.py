@@ -21,7 +21,8 @@ def forces(more, p, hamiltonian="p**2/2"):
 
 
 def test_a_motor_against_its_brake():
-    """A steady rotor's torque and friction cancel, and are as strong as each is; where parts add up, their sum counts."""
+    """A steady rotor's torque and friction cancel, and are as strong as each is; where parts add up, the
+    sum counts."""
     steady, rest = np.full(400, 1.0), np.zeros(400)
     motor = '[forces]\np = "0.3 - 0.3*p"'
     assert forces(motor, steady) == pytest.approx(np.hypot(0.3, 0.3))
