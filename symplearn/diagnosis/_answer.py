@@ -9,7 +9,7 @@ import numpy as np
 from .._effects import COORDINATE, IMPULSE, OUTLIERS, PAIR, Candidate
 from .._expression import Expression
 from . import _document as document
-from ._along import energy
+from ._along import along, energy, force
 from ._augment import augmented
 from ._build import rows_fitted
 from ._coefficients import coefficients
@@ -263,13 +263,20 @@ class Answer:
         return document.finite(mine - without)
 
     def _strength(self, member: int) -> float | None:
-        """An effect's amplitudes by their prior's scales, in shares of the forces already there; None for no force."""
+        """An effect's amplitudes by their prior's scales, in shares of the forces already there; None for no force, and
+        where none is there."""
         one, place = self.problem.candidate(member), dict(self.problem.placed(self.after.combination))[member]
-        if one.effect.acts_on != COORDINATE:
+        if one.effect.acts_on != COORDINATE or not self._there[:, one.place].any():
             return None
         amplitudes = self.after.z[place][: one.effect.amplitudes]
         scales = self.found.priors.scales[one.first : one.first + one.effect.amplitudes]
         return float(np.linalg.norm(amplitudes / scales)) * STRENGTH
+
+    @cached_property
+    def _there(self) -> np.ndarray:
+        """The force that the simulation has on every coordinate along the motion."""
+        o = self.lens[0]
+        return along(self.problem, force, o.recording, o.estimate.z, (), np.asarray(o.smoothed.means[: o.rows.fitted]))
 
     def _rivals(self, member: int) -> list[str]:
         """Effects that could stand in this one's place: in a likely combination that lacks it."""
