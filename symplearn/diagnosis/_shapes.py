@@ -13,6 +13,7 @@ from .._effects import Nameless
 from .._simulation_records import SimulationFile
 from .._symbolic import derivative
 from ._along import along, force
+from ._locate import strained_coordinates
 from ._outlook import Outlook
 from ._unnamed import along_path
 
@@ -21,8 +22,9 @@ from ._unnamed import along_path
 _KNEES, _TEETH, _WAVES = np.geomspace(0.01, 1.0, 13), np.arange(1.0, 25.0), np.arange(2.0, 24.0, 0.2)
 _PLACES, _WIDTHS = np.linspace(0.05, 0.95, 19), np.geomspace(0.03, 0.25, 5)
 # Members of a family that are weighed first, so many steps apart, and what share of the missing force each must
-# explain, beside what a constant, the place and the speed do. What is smoothed shows the sharp ones too little.
-_FIRST, _APART, _EXPLAINED = 3, 3, 0.05
+# explain, beside what a constant, the place and the speed do. What is smoothed shows the sharp ones too little. Of all
+# families so many, those that explain most.
+_FIRST, _APART, _EXPLAINED, _MOST = 3, 3, 0.05, 12
 # Share of the prior of what has no name that all families have, beside that of simple laws.
 _SHARE = 0.25
 # Forces that are the same but for round-off.
@@ -81,14 +83,16 @@ class Shapes:
 
     def first(self) -> list[Nameless]:
         """Of each family the laws whose shapes explain most of the missing force."""
-        out = list[Nameless]()
+        out = list[tuple[float, Nameless]]()
         for family, i in self._families.items():
             laws = [family.at(place) for place in family.places()]
             missing = np.concatenate([o.missing_force()[:, i] for o in self.outlooks])
             plain, shapes = self._values(_plain(self.file, i)), self._values([t for law in laws for t in law.pushes[0]])
             shares = _explained(plain, shapes.reshape(len(shapes), len(laws), -1), missing)
-            out += self._new(family, [(place, 1.0) for place in family.first(shares)])
-        return out
+            share = dict(zip(family.places(), shares, strict=True))
+            for place in family.first(shares):
+                out += [(share[place], law) for law in self._new(family, [(place, 1.0)])]
+        return [law for _, law in sorted(out, key=lambda one: -one[0])[:_MOST]]
 
     def has(self, law: Nameless | None) -> bool:
         """Whether a law is of one of the families."""
@@ -112,8 +116,10 @@ class Shapes:
     def _on_each(self) -> Iterator[tuple[Family, int]]:
         """Families, and which coordinate they are on."""
         points, turning = np.concatenate(self._points), _turning(self.outlooks[0], self._points[0])
-        for i, name in enumerate(self.file.coordinates):
+        known = range(len(self.file.coordinates))  # those of known unseen oscillators follow them
+        for i in set(known) & set(strained_coordinates(self.outlooks)):
             (_, q, v), low, high = _plain(self.file, i), float(points[:, i].min()), float(points[:, i].max())
+            name = self.file.coordinates[i]
             if low < high:
                 some = [_saturating(i, name, q, max(-low, high))]
                 some += [_cogging(i, name, q)] if turning[i] else _in_a_swing(i, name, q, v, low, high)
@@ -206,6 +212,8 @@ def _explained(
     plain: Float[np.ndarray, "row plain"], shapes: Float[np.ndarray, "row shape term"], push: Float[np.ndarray, " row"]
 ) -> Float[np.ndarray, " shape"]:
     """The share of a force that each shape explains of what the plain terms leave."""
+    finite = np.isfinite(plain).all(1) & np.isfinite(shapes).all((1, 2)) & np.isfinite(push)
+    plain, shapes, push = plain[finite], shapes[finite], push[finite]
     total = _left(plain, push)
     rests = [_left(np.concatenate([plain, shapes[:, k]], axis=1), push) for k in range(shapes.shape[1])]
     return 1.0 - np.array(rests) / total if total > 0 else np.zeros(len(rests))
