@@ -20,9 +20,9 @@ _SAME_STEP = 1.01
 def refuse_unlearnable(model: Any, several: Sequence[TimeSeries], verb: str) -> None:
     """Refuses a model of which nothing learns, too much does, or more than the recordings can say.
 
-    **Raises:** `InputError` where nothing learns, more than 1500 numbers do, the state is no phase point of the
-    Hamiltonian, a polynomial has more terms than there are readings, or the time step changes under process noise that
-    learns and is per data interval.
+    **Raises:** `InputError` where nothing learns, more than 1500 numbers do, nothing was read, the state is no phase
+    point of the Hamiltonian, a polynomial has more terms than there are readings, or the time step changes under
+    process noise that learns and is per data interval.
     """
     leaves = named_parameters(model)
     if not leaves:
@@ -33,9 +33,16 @@ def refuse_unlearnable(model: Any, several: Sequence[TimeSeries], verb: str) -> 
             f"{size} numbers learn, but `{verb}` is for at most {_MOST_PARAMETERS}: it keeps a square matrix of them; "
             "`train` is for networks."
         )
+    refuse_empty(several)
     refuse_wrong_state(model, _state_size(model, several))
     _refuse_terms(model, several)
     _refuse_steps(model, several)
+
+
+def refuse_empty(several: Sequence[TimeSeries]) -> None:
+    """Refuses, with `InputError`, recordings in which nothing was read."""
+    if all(bool(np.all(np.isnan(np.asarray(one.readings)))) for one in several):
+        raise InputError("Every reading is missing; there is nothing to learn from.")
 
 
 def _state_size(model: Any, several: Sequence[TimeSeries]) -> int:

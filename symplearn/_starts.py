@@ -55,11 +55,9 @@ class Scales(eqx.Module):
 def scales(model: Any, recordings: Sequence[TimeSeries]) -> Scales:
     """The scales of recordings under a model.
 
-    **Raises:** `InputError` where nothing was read, or every reading is the same.
+    **Raises:** `InputError` where every reading is the same.
     """
     rows = np.concatenate([np.asarray(one.readings) for one in recordings])
-    if np.all(np.isnan(rows)):
-        raise InputError("Every reading is missing; there is nothing to learn from.")
     size = _variances(rows)
     if not np.nanmax(size) > 0:
         raise InputError("Every channel stands still: its readings are all the same; there is no motion to learn from.")

@@ -23,6 +23,7 @@ from ._counts import refuse_count
 from ._errors import InputError, shown
 from ._faults import IMPOSSIBLE
 from ._keys import refuse_key
+from ._learnable import refuse_empty
 from ._objectives import AbstractObjective, TimeSeries, as_recordings
 from ._optimisers import AbstractOptimiser
 from ._parameters import named_parameters, partition, value_of
@@ -246,9 +247,8 @@ def train(
             f"`train` needs an optimiser, such as `Adam(0.05)` or a gradient transformation of optax, but was given "
             f"{shown(optimiser)}."
         )
+    refuse_empty(series)
     objective.refuse(model, series)
-    if not any(bool(jnp.any(~jnp.isnan(one.readings))) for one in series):
-        raise InputError("All readings are missing, so there is nothing to train on; give a recording with readings.")
     given = series if several else series[0]
     training = Training(objective, prior, optimiser, steps_of(objective, series))
     file = None

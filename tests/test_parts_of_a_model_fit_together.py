@@ -219,7 +219,7 @@ RECORDED = {
     ),
     "no readings": (
         lambda: sl.train(PENDULUM, EMPTY, sl.OneStepL1(1.0), optimiser=sl.Adam(), **TRAINING),
-        "All readings are missing",
+        "Every reading is missing",
     ),
     "a rule's name": (
         lambda: sl.train(PENDULUM, UNREAD, sl.OneStepL1(1.0), optimiser="adam", **TRAINING),
