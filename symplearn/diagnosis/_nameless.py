@@ -84,7 +84,8 @@ def _weigh_laws(search: Search, members: Sequence[int]) -> None:
         search.weigher.weigh(starts, whole=True)
     if _is_open(_odds(search), found):  # what was found may hide what a law does alone
         first = [s for s in promising(search.along(members), _REACH) if s.combination not in found.estimates]
-        search.weigher.weigh(first)
+        if first:
+            search.weigher.weigh(first)
     _weigh_beside_remainders(search, members)
 
 
