@@ -32,8 +32,9 @@ _BEHIND, _VAGUE, _MOST, _NEAR = 10.0, 0.3, 12, 8.0
 _BASES, _REACH = 2, 30.0
 # Second effects that are tried beside a law, at how many places each, and what they must promise.
 _BESIDE, _PLACES, _WORTH = 12, 60, 2.0
-# How many laws' shapes are moved, and by how many steps each time.
-_SHAPED, _SHARPER = 2, ((2.0, 1.0), (2.0, 1.0), (1.0, 0.5), (0.5, 0.25), (0.25,))
+# How many laws' shapes are moved that are no farther behind the best, and by how many steps each time: whatever is
+# added is compiled with all that was there.
+_SHAPED, _BLUNT, _SHARPER = 2, 15.0, ((3.0, 2.0, 1.0), (1.0, 0.5), (0.25,))
 # Remainders that are not weighed for every combination.
 _LATER = ("clock", "static", "force", "spell")
 
@@ -126,7 +127,7 @@ def _shaped(search: Search, shapes: Shapes) -> list[tuple[Combination, int]]:
     ranked = sorted(found.estimates, key=found.odds, reverse=True)
     for c in ranked:
         for m in c:
-            if shapes.has(found.problem.candidate(m).nameless) and found.odds(c) > found.odds(ranked[0]) - _REACH:
+            if shapes.has(found.problem.candidate(m).nameless) and found.odds(c) > found.odds(ranked[0]) - _BLUNT:
                 chosen.setdefault(m, c)
     return [(c, law) for law, c in list(chosen.items())[:_SHAPED]]
 
