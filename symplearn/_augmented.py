@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from ._effects import CENTRAL, SPRING, Candidate, Effect, Nameless, PowerForce, vocabulary
 from ._separable import is_separable
-from ._symbolic import derivative
+from ._symbolic import derivative, jax_function
 from ._symbolic_slopes import with_slopes
 from ._terms import Further, Mechanics
 
@@ -137,7 +137,7 @@ def equations(
         velocity=compiled([derivative(known.hamiltonian, p) for p in momenta]),
         softness=compiled([derivative(derivative(known.hamiltonian, p), p) for p in momenta]),
         kick=compiled(driven) if any(f != 0 for f in driven) else None,
-        parts=compiled([part for _, part in parts]),
+        parts=jax.jit(jax_function([part for _, part in parts], arguments)),  # which nobody differentiates
         pushed=tuple(place for place, _ in parts),
         readings=compiled(list(known.readings.values())),
         impulses=compiled([value for _, size, when in known.impulses for value in (size, when)]),

@@ -184,6 +184,13 @@ EFFECTS: dict[str, Effect] = {e.name: e for e in (*ON_COORDINATES, *ON_PAIRS, *O
 SIDES = ("upper", "lower")
 
 
+def takes_back(effect: Effect, coefficients: Mapping[str, Any]) -> bool:
+    """Whether an effect with these coefficients, as they are told, takes from a loss that a known term has too much of:
+    losses are positive otherwise."""
+    first = coefficients.get(effect.coefficients[0]) if effect.family == "dissipation" else None
+    return first is not None and (first.get("mean") or 0.0) < 0
+
+
 @dataclass(frozen=True)
 class Nameless:
     """A force that has no word: a sum of terms, each of a size of its own.

@@ -29,12 +29,13 @@ def every(family):
 
 
 def test_shapes_are_what_their_words_say():
-    """A saturating force is half way at half its knee's tanh and flat beyond, teeth and waves come back after their
-    part of a turn or of the way, and what acts at one place is gone three widths off."""
+    """A saturating force has tanh(1) of its size at its knee and all of it far beyond, teeth and waves come back after
+    their part of a turn or of the way, and what acts at one place is gone four widths off."""
     for law in every(_saturating(0, "q", Q, 2.0)):
         knee, ((term,),) = float(law.words.split()[-2]), law.pushes
-        # A rate of two digits is told as a knee of two digits.
+        # A knee of two digits is off by 5 % at most, a phase on which tanh(1) has the slope 0.42: 0.021.
         assert float(-term.subs(Q, knee)) == pytest.approx(np.tanh(1.0), abs=0.03)
+        # Of a knee that much off 1 - tanh(9.5) is left, 1.1e-8.
         assert float(-term.subs(Q, 10 * knee)) == pytest.approx(1.0, abs=1e-6)
     waves, *at_one_place = _in_a_swing(0, "q", Q, V, -1.0, 1.0)
     for law in every(waves) + every(_cogging(0, "q", Q)):

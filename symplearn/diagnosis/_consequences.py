@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from .._effects import Candidate
+from .._effects import Candidate, takes_back
 from ._law_text import number
 
 
@@ -22,8 +22,8 @@ class Said:
 
     @property
     def takes_back(self) -> bool:
-        """Whether it takes from a loss that a known term has too much of: losses are positive otherwise."""
-        return self.one.effect.family == "dissipation" and self.mean(self.one.effect.coefficients[0]) < 0
+        """Whether it takes from a loss that a known term has too much of."""
+        return takes_back(self.one.effect, self.coefficients)
 
     def value(self, name: str) -> str:
         """`0.03 +- 0.002 N/m`."""

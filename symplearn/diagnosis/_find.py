@@ -55,7 +55,8 @@ def searched(
     search = _run(stepper, seeds.z, deadline, options)
     steps = _refined(search, rebuild, (substep, is_fine), options)
     weigh_nameless(file, recordings, options, search)
-    if search.problem.equations is not built:  # a law may have a shape that passes faster than the motion
+    likeliest = max(search.found.estimates, key=search.found.odds)
+    if any(search.problem.candidate(m).nameless for m in likeliest):  # its shape may pass faster than the motion
         steps = _refined(search, lambda longest: rebuild(longest, search.problem.equations), steps, options)
     search.settle()
     found = search.found

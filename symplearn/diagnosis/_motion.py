@@ -16,9 +16,14 @@ _STEP = 1e-6
 
 def rms(values: np.ndarray) -> float:
     """Root mean square of the finite values; 1 where there is none, or none but zeros."""
-    square = values[np.isfinite(values)] ** 2
-    mean = float(np.sqrt(square.mean())) if square.size else 1.0
+    mean = float(np.sqrt(_mean_square(values)))
     return mean if np.isfinite(mean) and mean > 0 else 1.0
+
+
+def _mean_square(values: np.ndarray) -> float:
+    """Of the finite values; 0 where there is none."""
+    square = values[np.isfinite(values)] ** 2
+    return float(square.mean()) if square.size else 0.0
 
 
 def extent(paths: Sequence[Float[np.ndarray, "_ state"]]) -> float:
@@ -87,11 +92,6 @@ def _there(push: Float[np.ndarray, " row"], parts: Float[np.ndarray, "row part"]
     apart = sum(_mean_square(one) for one in (push - parts.sum(1), *parts.T))
     square = max(_mean_square(push), apart)
     return float(np.sqrt(square)) if square > 0 else stop
-
-
-def _mean_square(values: Float[np.ndarray, " row"]) -> float:
-    square = values[np.isfinite(values)] ** 2
-    return float(square.mean()) if square.size else 0.0
 
 
 def stiffening(

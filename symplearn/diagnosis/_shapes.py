@@ -15,7 +15,7 @@ from .._symbolic import derivative
 from ._along import along, force
 from ._locate import strained_coordinates
 from ._outlook import Outlook
-from ._unnamed import along_path
+from ._unnamed import along_outlooks, missing, points
 
 # Knees, as shares of how far the coordinate goes; teeth in a turn, or waves in a swing; places of the swing and widths,
 # as shares of it.
@@ -77,7 +77,6 @@ class Shapes:
 
     def __init__(self, file: SimulationFile, outlooks: Sequence[Outlook]):
         self.file, self.outlooks = file, outlooks
-        self._points = [_points(o, len(file.coordinates)) for o in outlooks]
         self._families = dict(self._on_each()) if outlooks else {}
         self._made: dict[str, tuple[Family, Place]] = {}
 
@@ -86,9 +85,10 @@ class Shapes:
         out = list[tuple[float, Nameless]]()
         for family, i in self._families.items():
             laws = [family.at(place) for place in family.places()]
-            missing = np.concatenate([o.missing_force()[:, i] for o in self.outlooks])
-            plain, shapes = self._values(_plain(self.file, i)), self._values([t for law in laws for t in law.pushes[0]])
-            shares = _explained(plain, shapes.reshape(len(shapes), len(laws), -1), missing)
+            terms = [*_plain(self.file, i), *(term for law in laws for term in law.pushes[0])]
+            values = along_outlooks(self.file, terms, self.outlooks)
+            shapes = values[:, 3:].reshape(len(values), len(laws), -1)
+            shares = _explained(values[:, :3], shapes, missing(self.outlooks)[:, i])
             share = dict(zip(family.places(), shares, strict=True))
             for place in family.first(shares):
                 out += [(share[place], law) for law in self._new(family, [(place, 1.0)])]
@@ -115,23 +115,16 @@ class Shapes:
 
     def _on_each(self) -> Iterator[tuple[Family, int]]:
         """Families, and which coordinate they are on."""
-        points, turning = np.concatenate(self._points), _turning(self.outlooks[0], self._points[0])
+        every = [points(self.file, o) for o in self.outlooks]
+        ends, turning = np.concatenate(every), _turning(self.outlooks[0], every[0])
         known = range(len(self.file.coordinates))  # those of known unseen oscillators follow them
         for i in set(known) & set(strained_coordinates(self.outlooks)):
-            (_, q, v), low, high = _plain(self.file, i), float(points[:, i].min()), float(points[:, i].max())
+            (_, q, v), low, high = _plain(self.file, i), float(ends[:, i].min()), float(ends[:, i].max())
             name = self.file.coordinates[i]
             if low < high:
                 some = [_saturating(i, name, q, max(-low, high))]
                 some += [_cogging(i, name, q)] if turning[i] else _in_a_swing(i, name, q, v, low, high)
                 yield from ((family, i) for family in some)
-
-    def _values(self, terms: Iterable[sympy.Expr]) -> Float[np.ndarray, "row term"]:
-        """Terms along the smoothed motion of all recordings."""
-        columns, terms = list[np.ndarray](), list(terms)
-        for o, x in zip(self.outlooks, self._points, strict=True):
-            fixed = o.stepper.problem.parameter_values(o.recording, o.estimate.z)[: len(self.file.parameters)]
-            columns.append(along_path(self.file, terms, fixed, x, o.rows.inputs[: len(x)], o.rows.times[: len(x)]))
-        return np.concatenate(columns)
 
 
 def _plain(file: SimulationFile, i: int) -> tuple[sympy.Expr, sympy.Expr, sympy.Expr]:
@@ -189,12 +182,6 @@ def _in_a_swing(i: int, name: str, q: sympy.Expr, v: sympy.Expr, low: float, hig
 def _rounded(value: float, digits: int) -> float:
     """As a law is told."""
     return float(f"{value:.{digits}g}")
-
-
-def _points(o: Outlook, d: int) -> Float[np.ndarray, "row two_d"]:
-    """The smoothed phase points of the file's own coordinates, at the rows that are fitted."""
-    means, width = np.asarray(o.smoothed.means[: o.rows.fitted]), o.stepper.problem.equations.width
-    return np.concatenate([means[:, :d], means[:, width : width + d]], axis=1)
 
 
 def _turning(o: Outlook, points: Float[np.ndarray, "row two_d"]) -> Bool[np.ndarray, " d"]:

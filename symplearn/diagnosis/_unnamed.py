@@ -40,16 +40,7 @@ def proposals(file: SimulationFile, outlooks: Sequence[Outlook], coordinates: Se
     `outlooks` hold the missing force of the simulation without effects, by recording.
     """
     terms = library(file)
-    problem, d = outlooks[0].stepper.problem, len(file.coordinates)
-    columns, force = [], []
-    for o in outlooks:
-        n, width = o.rows.fitted, problem.equations.width
-        means = np.asarray(o.smoothed.means[:n])
-        path = np.concatenate([means[:, :d], means[:, width : width + d]], axis=1)
-        fixed = problem.parameter_values(o.recording, o.estimate.z)[: len(file.parameters)]
-        columns.append(along_path(file, terms, fixed, path, o.rows.inputs[:n], o.rows.times[:n]))
-        force.append(o.missing_force())
-    values, push, out = np.concatenate(columns), np.concatenate(force), []
+    values, push, out = along_outlooks(file, terms, outlooks), missing(outlooks), list[Proposal]()
     for i in coordinates:
         chosen, sizes, explained = stable_terms(values, push[:, i])
         if chosen and explained > _EXPLAINED:
@@ -78,6 +69,35 @@ def library(file: SimulationFile) -> list[sympy.Expr]:
     out += [form for one in v for form in (Absolute(one) * one, Sign(one))]
     inputs = [states[u] for u in file.recording.inputs]
     return out + inputs + [u * letter for u in inputs for letter in letters]
+
+
+def missing(outlooks: Sequence[Outlook]) -> Float[np.ndarray, "row coordinate"]:
+    """The smoothed missing force at the rows of all recordings."""
+    return np.concatenate([o.missing_force() for o in outlooks])
+
+
+def along_outlooks(
+    file: SimulationFile, terms: Sequence[sympy.Expr], outlooks: Sequence[Outlook]
+) -> Float[np.ndarray, "row term"]:
+    """Terms along the smoothed motion at those rows."""
+    columns = []
+    for o in outlooks:
+        fixed, x = (
+            o.stepper.problem.parameter_values(o.recording, o.estimate.z)[: len(file.parameters)],
+            points(file, o),
+        )
+        columns.append(along_path(file, terms, fixed, x, o.rows.inputs[: len(x)], o.rows.times[: len(x)]))
+    return np.concatenate(columns)
+
+
+def points(file: SimulationFile, o: Outlook) -> Float[np.ndarray, "row two_d"]:
+    """The smoothed phase points of the file's own coordinates."""
+    means, d, width = (
+        np.asarray(o.smoothed.means[: o.rows.fitted]),
+        len(file.coordinates),
+        o.stepper.problem.equations.width,
+    )
+    return np.concatenate([means[:, :d], means[:, width : width + d]], axis=1)
 
 
 def along_path(

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from .. import _effects as effects
 from .._effects import EFFECTS
 from .._errors import printable
 from .._vocabulary import COLUMN, PARAMETER, VOCABULARY
@@ -66,12 +67,9 @@ def side(finding: Mapping[str, Any]) -> str | None:
 
 
 def takes_back(finding: Mapping[str, Any]) -> bool:
-    """Whether it takes from a loss that a known term has too much of: losses are positive otherwise."""
+    """Whether it takes from a loss that a known term has too much of."""
     known = EFFECTS.get(finding["effect"])
-    if known is None or known.family != "dissipation":
-        return False
-    first = (finding.get("coefficients") or {}).get(known.coefficients[0]) or {}
-    return (first.get("mean") or 0.0) < 0
+    return known is not None and effects.takes_back(known, finding.get("coefficients") or {})
 
 
 def effect(finding: Mapping[str, Any], recordings: int = 1) -> str:
