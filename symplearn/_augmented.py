@@ -9,7 +9,7 @@ import numpy as np
 import sympy
 from jaxtyping import Array
 
-from ._effects import CENTRAL, SPRING, Candidate, Effect, Nameless, PowerForce, vocabulary
+from ._effects import CENTRAL, SPRING, Candidate, Effect, Memory, Nameless, PowerForce, vocabulary
 from ._separable import is_separable
 from ._symbolic import derivative, jax_function
 from ._symbolic_slopes import with_slopes
@@ -39,7 +39,9 @@ class Equations:
     delayed: bool
     start: float  # time of the first row used, from which drifts count
     origin: float  # time that phases inside count from
-    declared: int  # coordinates of the file; the others are known hidden oscillators
+    declared: int  # coordinates of the file; the others are known hidden oscillators, and what known forces remember
+    remembered: tuple[int, ...]  # coordinates that only stand for what a known force remembers, their momentum
+    fades: bool  # whether forces that fade are built in, on every coordinate of the file
     jumping: tuple[int, ...]  # coordinates with known impulses
     further: tuple[Further, ...]  # parameters that the file's terms bring along
     energy: Callable[[Array], Array]
@@ -131,6 +133,8 @@ def equations(
         origin=known.start if origin is None else origin,
         declared=known.declared,
         further=tuple(known.further),
+        remembered=tuple(known.remembered),
+        fades=any(isinstance(one.effect, Memory) for one in candidates),
         jumping=tuple(place for place, _, _ in known.impulses),
         energy=compiled([energy]),
         slope=compiled([derivative(energy, q) - f for q, f in zip(coordinates, still, strict=True)]),

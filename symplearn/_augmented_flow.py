@@ -130,8 +130,8 @@ class SimulatedFlow(eqx.Module):
         since a kick as long as this one.
         """
         if system.equations.kick is None:
-            half = p + 0.5 * dt * _drag(system, q, p)
-            p = p + dt * _drag(system, q, half)
+            half = p + 0.5 * dt * system.smooth_force(q, p)
+            p = p + dt * system.smooth_force(q, half)
         free = jnp.zeros(p.shape, bool)
         return jax.lax.cond(
             self.system.switches.friction, lambda p: _rubbed(system, q, p, dt, ahead, stuck), lambda p: (p, free), p
@@ -170,11 +170,6 @@ class SimulatedFlow(eqx.Module):
         return jnp.where(inside, size, 0.0), jnp.where(inside, share, 0.0), places
 
 
-def _drag(system: SimulatedHamiltonian, q: Array, p: Array) -> Float[Array, " width"]:
-    """Smooth forces that a velocity enters, by component of the momentum."""
-    return jnp.pad(system.smooth_force(q, p), (0, system.equations.width - system.equations.dim))
-
-
 def _dragged(system: SimulatedHamiltonian, q: Array, p: Array, dt: Array) -> Float[Array, " width"]:
     """The momentum after these have acted for `dt` at frozen q, by classical Runge-Kutta; its stages are a loop, so
     that the force is compiled once."""
@@ -182,7 +177,7 @@ def _dragged(system: SimulatedHamiltonian, q: Array, p: Array, dt: Array) -> Flo
     def stage(carry: tuple[Array, Array], row: Array) -> tuple[tuple[Array, Array], None]:
         total, rate = carry
         place, weight = row
-        rate = _drag(system, q, p + place * dt * rate)
+        rate = system.smooth_force(q, p + place * dt * rate)
         return (total + weight * dt * rate, rate), None
 
     return jax.lax.scan(stage, (p, jnp.zeros_like(p)), jnp.asarray(_STAGES, p.dtype))[0][0]

@@ -19,6 +19,7 @@ from ._effects import (
     FORCING,
     GYROSCOPIC,
     HIDDEN,
+    MEMORIES,
     MODULATION,
     ON_PARAMETERS,
     QUADRATIC,
@@ -39,7 +40,7 @@ def taken_apart(equations: Equations, coefficients: Float[Array, " coefficient"]
     for one in {(c.effect, c.side): c for c in equations.candidates}.values():
         firsts = equations.firsts(one.effect, one.side)
         entries = range(one.effect.size + one.effect.switched)
-        found[one.effect.name, one.side] = tuple(coefficients[firsts + k] for k in entries)
+        found[one.effect.kept_as, one.side] = tuple(coefficients[firsts + k] for k in entries)
     for effect in ON_PARAMETERS:  # of which a simulation may have none
         found.setdefault((effect.name, None), (coefficients[:0],) * effect.size)
     return found
@@ -80,7 +81,7 @@ class SimulatedHamiltonian(ig.AbstractHamiltonian):
 
     def of(self, effect: Effect, value: int = 0, side: str | None = None) -> Float[Array, " target"]:
         """One value of an effect, by target."""
-        return self.values[effect.name, side][value]
+        return self.values[effect.kept_as, side][value]
 
     @eqx.filter_jit
     def arguments(self, q: Float[Array, " width"], p: Float[Array, " width"]) -> Float[Array, " argument"]:
@@ -110,15 +111,29 @@ class SimulatedHamiltonian(ig.AbstractHamiltonian):
         return jnp.concatenate([slope - jnp.pad(push + present * q[d], (0, d - n)), unseen[None]])
 
     @eqx.filter_jit
-    def smooth_force(self, q: Float[Array, " width"], p: Float[Array, " width"]) -> Float[Array, " d"]:
-        """Forces that a velocity enters, dry friction left out."""
+    def smooth_force(self, q: Float[Array, " width"], p: Float[Array, " width"]) -> Float[Array, " width"]:
+        """Forces that a velocity enters, or that fade; dry friction left out."""
         eq, n = self.equations, self.equations.declared
         arguments = self.arguments(q, p)
         v = eq.velocity(arguments)[:n]
         drag = self.of(VISCOUS) + self.of(QUADRATIC) * jnp.abs(v) - self.of(EXCITATION)
         force = -(drag + self.of(EXCITATION, 1) * q[:n] ** 2) * v
         force = jnp.pad(force + self._between(v), (0, eq.dim - n))
-        return force if eq.kick is None else force + eq.kick(arguments)
+        force = force if eq.kick is None else force + eq.kick(arguments)
+        return self._fading(force, v, p[eq.dim]) if eq.fades else jnp.pad(force, (0, eq.width - eq.dim))
+
+    def _fading(
+        self, force: Float[Array, " d"], v: Float[Array, " declared"], w: Float[Array, ""]
+    ) -> Float[Array, " width"]:
+        """Forces with one that fades, w, and what w changes by."""
+        present, gained, lost = jnp.zeros_like(v), jnp.zeros_like(w), jnp.zeros_like(w)
+        for effect in MEMORIES:
+            kappa, fading, here = (self.of(effect, k) for k in range(3))
+            present = present + here
+            gained = gained + (kappa * v).sum()
+            lost = lost + (here * fading * (jnp.abs(v) if effect.by_way else 1.0)).sum()
+        pushed = force - w * jnp.pad(present, (0, len(force) - len(v)))
+        return jnp.concatenate([pushed, (gained - lost * w)[None]])
 
     def _between(self, v: Float[Array, " declared"]) -> Float[Array, " declared"]:
         """Forces between pairs of coordinates that a velocity enters."""
@@ -134,9 +149,9 @@ class SimulatedHamiltonian(ig.AbstractHamiltonian):
         q, p = ig.split(x)
         eq = self.equations
         dry = self.of(COULOMB) * jnp.sign(self.velocity(q, p)[: eq.declared])
-        force = self.smooth_force(q, p) - jnp.pad(dry, (0, eq.dim - eq.declared))
+        force = self.smooth_force(q, p) - jnp.pad(dry, (0, eq.width - eq.declared))
         before = jnp.zeros(eq.momentum.start, x.dtype)
-        return self.vector_field(x) + jnp.concatenate([before, jnp.pad(force, (0, eq.width - eq.dim))])
+        return self.vector_field(x) + jnp.concatenate([before, force])
 
 
 class Simulated(eqx.Module):

@@ -38,6 +38,11 @@ class Effect:
     switched: bool = False
 
     @property
+    def kept_as(self) -> str:
+        """What its values are kept under."""
+        return self.name
+
+    @property
     def family(self) -> str:
         return VOCABULARY[self.name].family
 
@@ -142,6 +147,25 @@ class HiddenOscillator(Effect):
         return np.array([named["kappa"] ** 2, named["omega"]])
 
 
+@dataclass(frozen=True)
+class Memory(Effect):
+    """A force w against the motion that fades: dw/dt = kappa v - fading w, or - fading |v| w where it fades `by_way`.
+
+    With time it is a spring and a damper in series (Maxwell 1867), with the way a friction that gives at first (Dahl
+    1968). w takes the place of an unseen oscillator's momentum, and its start is as open.
+    """
+
+    by_way: bool = False
+
+    @property
+    def coefficients(self) -> tuple[str, ...]:
+        return "kappa", "fading"
+
+    @property
+    def kept_as(self) -> str:
+        return f"{self.name}, {'by way' if self.by_way else 'by time'}"
+
+
 VISCOUS = Drag("viscous_damping", positive=True, power=1)
 QUADRATIC = Drag("quadratic_drag", positive=True, power=2)
 COULOMB = Drag("coulomb_friction", positive=True, power=0)
@@ -175,6 +199,10 @@ OUTLIERS = Effect("sensor_outliers", amplitudes=0)
 # Beside the powers these shape a force of place that has no word; they are never reported.
 SHAPES = (PowerForce("quartic_stiffness", power=4), PowerForce("quintic_stiffness", power=5))
 UNNAMED = Effect("unnamed_force")  # its amplitudes are as many as its terms
+RELAXING, SLIPPING = MEMORIES = (
+    Memory("unnamed_force", places=("fading",), positive=True, switched=True),
+    Memory("unnamed_force", places=("fading",), positive=True, switched=True, by_way=True),
+)
 
 ON_COORDINATES = (*POWERS, VISCOUS, QUADRATIC, COULOMB, EXCITATION, STOP, FORCING, IMPULSE, HIDDEN)
 ON_PAIRS = (RELATIVE, SPRING, CENTRAL, GYROSCOPIC)
@@ -198,7 +226,8 @@ class Nameless:
     **Arguments:** - `places`: numbers of the coordinates that it acts on. - `pushes`: its terms on each of them; terms
     of one number have one size. - `choices`: the logarithm of how many forces it was chosen from. - `words`: what it
     does, as in "goes with ..."; empty where only its expression tells. - `kind`: the family of the vocabulary that it
-    would be of where its size is positive; empty where of none.
+    would be of where its size is positive; empty where of none. - `memory`: what it is where it has one, instead of
+    terms.
     """
 
     places: tuple[int, ...]
@@ -206,10 +235,11 @@ class Nameless:
     choices: float = 0.0
     words: str = ""
     kind: str = ""
+    memory: Memory | None = None
 
     def on(self, place: int) -> "Nameless":
         """What it is on one of its coordinates."""
-        return replace(self, places=(place,), pushes=(self.pushes[self.places.index(place)],))
+        return self if self.memory else replace(self, places=(place,), pushes=(self.pushes[self.places.index(place)],))
 
 
 @dataclass(frozen=True)
@@ -280,7 +310,8 @@ def vocabulary(
         listed += [Candidate(effect, (c,), (j,)) for j, c in enumerate(columns)]
     listed += [Candidate(effect, (q,), (i,)) for effect in SHAPES for i, q in enumerate(coordinates)]
     for force in nameless:
-        effect, targets = replace(UNNAMED, amplitudes=len(force.pushes[0])), tuple(coordinates[i] for i in force.places)
+        effect = force.memory or replace(UNNAMED, amplitudes=len(force.pushes[0]))
+        targets = tuple(coordinates[i] for i in force.places)
         listed.append(Candidate(effect, targets, force.places, nameless=force))
     first = np.cumsum([0, *(one.effect.size + one.effect.switched for one in listed)])
     return tuple(replace(one, first=int(k)) for one, k in zip(listed, first, strict=False))

@@ -28,7 +28,8 @@ class Term:
     """Physics already added: one of the effects of the contract's section 3 on its targets.
 
     `target` has two names for an effect between two coordinates, otherwise one. `recordings` is `None` where
-    the term is in all of them.
+    the term is in all of them. `memory` is what an unnamed force remembers: the rate of change of every further name
+    that its expression uses.
     """
 
     effect: str
@@ -37,6 +38,7 @@ class Term:
     side: str | None = None
     expression: Expression | None = None
     recordings: tuple[int, ...] | None = None
+    memory: Mapping[str, Expression] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

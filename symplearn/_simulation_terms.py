@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from ._errors import InputError, nearest, shown
-from ._expression import Expression, parse_expression
+from ._expression import NAME, RESERVED, Expression, parse_expression
 from ._simulation_records import Quantity, Term
 from ._simulation_schema import SimulationTable, checked_quantity
 from ._vocabulary import COLUMN, COORDINATE, FORBIDDEN, PAIR, PARAMETER, VOCABULARY, Word
@@ -32,13 +32,15 @@ class TermReader:
         where = f"{self.file}, [[terms]] {number}"
         word = self.word(data, where)
         self.check_keys(data, word, where)
+        memory = self.memory(data, where) if word.expression else {}
         return Term(
             effect=word.name,
             target=self.target(data, word, where),
             coefficients={name: self.coefficient(data, name, word, where) for name in word.coefficients},
             side=self.side(data, word, where),
-            expression=self.expression(data, word, where),
+            expression=self.expression(data["expression"], memory, f"{where} expression") if word.expression else None,
             recordings=_recordings(data, where),
+            memory=memory,
         )
 
     def word(self, data: Mapping[str, Any], where: str) -> Word:
@@ -53,7 +55,13 @@ class TermReader:
 
     def check_keys(self, data: Mapping[str, Any], word: Word, where: str) -> None:
         needed = ["target", *word.coefficients, *(["expression"] if word.expression else [])]
-        known = ["effect", *needed, *(["side"] if word.sides else []), "recordings"]
+        known = [
+            "effect",
+            *needed,
+            *(["side"] if word.sides else []),
+            *(["memory"] if word.expression else []),
+            "recordings",
+        ]
         for key in data:
             if key not in known:
                 raise InputError(f"{where} {shown(key)[1:-1]}: unknown key for {word.name}; {nearest(key, known)}")
@@ -111,13 +119,26 @@ class TermReader:
             raise InputError(f"{where} side: unknown word {shown(side)}; write `upper` or `lower`")
         return side
 
-    def expression(self, data: Mapping[str, Any], word: Word, where: str) -> Expression | None:
-        if not word.expression:
-            return None
-        text, where = data["expression"], f"{where} expression"
+    def memory(self, data: Mapping[str, Any], where: str) -> dict[str, Expression]:
+        """Further names of an expression, each with its rate of change."""
+        given = data.get("memory", {})
+        if not isinstance(given, Mapping):
+            raise InputError(
+                f'{where} memory: {shown(given)} was given where a table such as {{ w = "2*v - w" }} is needed, '
+                "which tells what each name changes by in a unit of time"
+            )
+        for name in given:
+            if not NAME.fullmatch(name) or name in RESERVED or name in self.names:
+                raise InputError(
+                    f"{where} memory: {shown(name)} cannot be a name here; use letters, digits and _, starting with a "
+                    "letter or _, and no name that is declared already or has a fixed meaning"
+                )
+        return {name: self.expression(text, given, f"{where} memory.{name}") for name, text in given.items()}
+
+    def expression(self, text: Any, further: Collection[str], where: str) -> Expression:
         if not isinstance(text, str):
             raise InputError(f"{where}: {shown(text)} was given where text in quotes is needed")
-        return Expression(text, parse_expression(text, self.names, where=where))
+        return Expression(text, parse_expression(text, [*self.names, *further], where=where))
 
 
 def _recordings(data: Mapping[str, Any], where: str) -> tuple[int, ...] | None:

@@ -66,7 +66,7 @@ def _term(term: Term) -> Iterator[str]:
     yield "[[terms]]"
     yield f"effect = {_text(term.effect)}"
     yield f"target = {_value(term.target if len(term.target) > 1 else term.target[0])}"
-    entries = dict(term.coefficients) | _given(term, side=None, expression=None, recordings=None)
+    entries = dict(term.coefficients) | _given(term, side=None, expression=None, recordings=None, memory={})
     yield from (f"{_key(key)} = {_value(value)}" for key, value in entries.items())
 
 

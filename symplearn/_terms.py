@@ -35,7 +35,8 @@ class Further:
 class Mechanics:
     """The expressions of a simulation: Hamiltonian, force on every momentum, and reading of every column.
 
-    The first `declared` coordinates are the file's own; known hidden oscillators follow them.
+    The first `declared` coordinates are the file's own; known hidden oscillators follow them, and what known forces
+    remember, of which only the momentum has a meaning: a number with a rate of change.
     """
 
     coordinates: list[sympy.Symbol]
@@ -47,6 +48,7 @@ class Mechanics:
     declared: int = 0
     impulses: list[tuple[int, sympy.Expr, sympy.Expr]] = field(default_factory=list)
     further: list[Further] = field(default_factory=list)
+    remembered: list[int] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.declared = self.declared or len(self.coordinates)
@@ -143,19 +145,31 @@ def _impulse(built: Mechanics, term: Term, c: _Numbers) -> None:
     built.impulses.append((built.place(term.target[0]), _on(c) * c["j"], c["t_star"]))
 
 
-def _hidden_oscillator(built: Mechanics, term: Term, c: _Numbers) -> None:
+def _unseen(built: Mechanics, name: str) -> tuple[sympy.Symbol, sympy.Symbol]:
+    """A further coordinate and its momentum."""
     number = len(built.coordinates) - built.declared + 1
-    z, momentum = (sympy.Symbol(f"{name}{number}*", real=True) for name in ("hidden", "hidden_momentum"))
+    z, momentum = (sympy.Symbol(f"{one}{number}*", real=True) for one in (name, f"{name}_momentum"))
     built.coordinates.append(z)
     built.momenta.append(momentum)
     built.forces.append(sympy.Integer(0))
+    return z, momentum
+
+
+def _hidden_oscillator(built: Mechanics, term: Term, c: _Numbers) -> None:
+    z, momentum = _unseen(built, "hidden")
     coupling = _on(c) * c["kappa"] * symbol(term.target[0]) * z
     built.hamiltonian += momentum**2 / 2 + c["omega"] ** 2 * z**2 / 2 - coupling
 
 
 def _unnamed_force(built: Mechanics, term: Term, c: _Numbers) -> None:
     assert term.expression is not None  # the file was checked
-    _push(built, term.target[0], _on(c) * term.expression.tree)
+    named: dict[sympy.Expr, sympy.Expr] = {}
+    for name in term.memory:
+        built.remembered.append(len(built.coordinates))
+        _, named[symbol(name)] = _unseen(built, "memory")
+    for name, rate in term.memory.items():
+        built.forces[built.momenta.index(named[symbol(name)])] = rate.tree.xreplace(named)
+    _push(built, term.target[0], _on(c) * term.expression.tree.xreplace(named))
 
 
 def _scaled(change: Callable[[Mechanics, _Numbers], sympy.Expr]) -> Callable[[Mechanics, Term, _Numbers], None]:

@@ -21,11 +21,12 @@ def augmented(
     estimate: Estimate,
     coefficients: Mapping[int, Mapping[str, float]],
     expressions: Mapping[int, Mapping[Candidate, Expression]],
+    memories: Mapping[int, Mapping[str, Expression]],
 ) -> SimulationFile:
     """Findings as `[[terms]]` with point values, merged with a term already there, and recalibrated parameters.
 
     A calibrated parameter keeps its bounds and gets its posterior as prior. `coefficients` are by member, as are the
-    `expressions` of forces without a name, on each coordinate.
+    `expressions` of forces without a name, on each coordinate, and the `memories` of those that have one.
     """
     parameters, c = dict(file.parameters), problem.calibrated
     z = within_bounds(problem, priors, estimate).z[problem.head : problem.slots]
@@ -38,6 +39,7 @@ def augmented(
         terms = _merged(terms, _term(problem, member, values))
     for member, some in expressions.items():
         bare = _term(problem, member, {})
+        bare = replace(bare, memory=memories.get(member, {}))
         terms += [replace(bare, target=one.targets, expression=expression) for one, expression in some.items()]
     return replace(file, parameters=parameters, terms=tuple(terms))
 

@@ -161,13 +161,16 @@ def _integrator(file: SimulationFile, built: Equations) -> ig.AbstractIntegrator
 
 
 def _initial(file: SimulationFile, built: Equations) -> InitialPrior:
-    """Priors of the file's states; a known hidden oscillator's is open, one that is searched for starts at rest."""
+    """Priors of the file's states; those of what is known but not seen are open, what is searched for starts at
+    rest."""
     mean, sd = [], []
-    for names in (file.coordinates, file.momenta):
+    further = range(len(file.coordinates), built.dim)
+    open_ = [[0.0 if k in built.remembered else np.inf for k in further], [np.inf for _ in further]]
+    for names, unseen in zip((file.coordinates, file.momenta), open_, strict=True):
         given = [file.initial.get(name) for name in names]
         mean += [0.0 if q is None else q.value for q in given] + [0.0] * (built.width - len(names))
         sd += [np.inf if q is None else (0.0 if q.known else _sd(q)) for q in given]
-        sd += [np.inf] * (built.dim - len(names)) + [0.0] * built.hidden
+        sd += unseen + [0.0] * built.hidden
     return InitialPrior(np.array(mean), np.array(sd))
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._effects import HIDDEN
 from ._problem import Combination, Problem
 from ._trajectory import Predictions, Stepper
 
@@ -55,10 +54,13 @@ class Priors:
         values = self.precision.copy()
         for member, place in problem.placed(combination):
             values[place] = self.scales[problem.candidate(member).values] ** -2.0
-            if problem.candidate(member).effect is HIDDEN:
-                for r in problem.members[member].recordings:
-                    values[problem.unseen(r)] = self.unseen**-2.0
+            starts = problem.starts(member)
+            values[starts] = self.starts_of(starts.shape[1]) ** -2.0
         return values
+
+    def starts_of(self, number: int) -> Float[np.ndarray, " start"]:
+        """Scales of where what is unseen begins: an oscillator, or the one number of a force that fades."""
+        return self.unseen[:number]
 
     def mean_of(self, problem: Problem, combination: Combination) -> Float[np.ndarray, " z"]:
         """Prior means with the entries of a combination filled in."""

@@ -4,11 +4,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from .. import _effects as effects
 from .._effects import Candidate, Drag, Oscillating, PowerForce
 from ._activity import powers
 from ._calibrate import Priors
+from ._memories import Span
 from ._motion import Motion, rms
 from ._problem import Problem
 
@@ -37,7 +39,7 @@ def with_effects(problem: Problem, priors: Priors, motion: Motion) -> Priors:
         if one.effect.places:
             place = amplitudes.stop
             low, high = _range(motion, one)
-            centres[place], scales[place] = (low + high) / 2, (high - low) / np.sqrt(12)
+            centres[place], scales[place] = _even(low, high)
             lower[place], upper[place] = low, high
     scales = np.where(np.isfinite(scales) & (scales > 0), scales, 1.0)
     starts = [_unseen(motion, i, _looseness(problem, priors, motion, i)) for i in range(problem.equations.declared)]
@@ -122,14 +124,27 @@ def _range(motion: Motion, one: Candidate) -> tuple[float, float]:
     return motion.first, motion.last
 
 
-def with_nameless(problem: Problem, priors: Priors, scales: Sequence[float]) -> Priors:
+def with_nameless(
+    problem: Problem, priors: Priors, scales: Sequence[Float[np.ndarray, " amplitude"]], spans: Sequence[Span | None]
+) -> Priors:
     """Priors with those of forces without a name, which stand last, behind all that has some already: `scales` of their
-    amplitudes, in their order."""
+    amplitudes, in their order, and between what the fading of each lies that fades."""
     grown = {}
     for name, fill in (("centres", 0.0), ("scales", 1.0), ("lower", -np.inf), ("upper", np.inf)):
         values = np.full(problem.equations.size, fill)
         old = getattr(priors, name)
         values[: len(old)] = old
         grown[name] = values
-    grown["scales"][problem.equations.size - len(scales) :] = scales
+    last = problem.equations.candidates[-len(scales) :]
+    for one, scale, span in zip(last, scales, spans, strict=True):
+        place = one.first + one.effect.amplitudes
+        grown["scales"][one.first : place] = scale
+        if span is not None:
+            grown["lower"][place], grown["upper"][place] = span.low, span.high
+            grown["centres"][place], grown["scales"][place] = _even(span.low, span.high)
     return replace(priors, **grown)
+
+
+def _even(low: float, high: float) -> tuple[float, float]:
+    """Mean and standard deviation of what may be anywhere between."""
+    return (low + high) / 2, (high - low) / np.sqrt(12)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from .._effects import HIDDEN
 from ._calibrate import Fits, Priors, by_the_noise, noise_roots, weights
 from ._problem import Combination, Problem
 from ._scan import layout, packed
@@ -73,7 +72,7 @@ class Regression:
         self._project(*((some, others) if whiten is None else (whiten(some), whiten(others))))
 
     def _is_unseen(self, member: int) -> bool:
-        return self.problem.candidate(member).effect is HIDDEN
+        return self.problem.candidate(member).effect.switched
 
     def _project(self, some: np.ndarray, others: np.ndarray) -> None:
         """The Gram matrix of the error and of all amplitudes, and how the other unknowns follow each of them."""

@@ -11,6 +11,7 @@ from .._recording import Recording
 from .._simulation_records import SimulationFile
 from ._build import augmented_equations, build
 from ._effect_priors import STRENGTH, with_nameless
+from ._memories import Span, fading, stiffness
 from ._options import Options
 from ._search import Search
 from ._trajectory import Stepper
@@ -40,8 +41,8 @@ class Extended:
         built = augmented_equations(self.file, first, restriction, middle, forces)
         longest = float(np.max(problem.rows[0].spans.step)) * (1 + 1e-9)
         problem = build(self.file, built, self.recordings, self.options.holdout, longest, restriction)
-        scales = [float(x) for each in self._scales(forces) for x in each]
-        search.goes_on(Stepper(problem, self.options.jobs), with_nameless(problem, search.found.priors, scales))
+        priors = with_nameless(problem, search.found.priors, self._scales(forces), [self._span(one) for one in forces])
+        search.goes_on(Stepper(problem, self.options.jobs), priors)
 
     def members(self, number: int) -> range:
         """Of the last so many forces that the search was extended by."""
@@ -49,18 +50,34 @@ class Extended:
         return range(every - number, every)
 
     def _scales(self, forces: Sequence[Nameless]) -> list[Float[np.ndarray, " amplitude"]]:
-        """Prior scales of their amplitudes: as strong as every other effect where it is strongest."""
+        """Prior scales of their amplitudes: as strong as every other effect where it is strongest; what fades, as if it
+        did not."""
         sizes = iter(self._sizes([term for force in forces for terms in force.pushes for term in terms]))
         out = []
         with np.errstate(divide="ignore"):
             for force in forces:
+                if force.memory is not None:
+                    (i,) = force.places
+                    out.append(np.array([STRENGTH * stiffness(self.search.typical[i], self._along(i))]))
+                    continue
                 each = [[self.search.typical[i] / next(sizes) for _ in terms]
                         for i, terms in zip(force.places, force.pushes, strict=True)]  # fmt: skip
                 out.append(STRENGTH * np.min(each, axis=0))
         return out
 
+    def _span(self, force: Nameless) -> Span | None:
+        if force.memory is None:
+            return None
+        return fading(force.memory, self._along(force.places[0]), [r.times for r in self.search.problem.rows])
+
+    def _along(self, i: int) -> list[Float[np.ndarray, " row"]]:
+        """A coordinate along the motion that every prior of an effect comes from, by recording."""
+        return [path[:, i] for path in self.search.likely[1]]
+
     def _sizes(self, terms: Sequence[sympy.Expr]) -> Float[np.ndarray, " term"]:
         """Root mean squares of terms along the motion that every prior of an effect comes from."""
+        if not terms:
+            return np.zeros(0)
         problem, (z, paths), columns = self.search.problem, self.search.likely, []
         d, width = len(self.file.coordinates), problem.equations.width
         for r, (path, rows) in enumerate(zip(paths, problem.rows, strict=True)):

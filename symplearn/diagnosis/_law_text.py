@@ -90,8 +90,8 @@ def equation_lines(
 ) -> tuple[str, ...]:
     """The equations of motion and the readings, one line each, with the chosen effects' numbers in place.
 
-    A hidden oscillator brings two more equations; a jump, a changed parameter and a changed scatter have a line of
-    their own.
+    A hidden oscillator brings two more equations, what a force remembers one; a jump, a changed parameter and a changed
+    scatter have a line of their own.
 
     **Arguments:** - `forces`: known forces by momentum. - `readings`: what the columns show. - `chosen`: effects with
     the contract's coefficients.
@@ -124,6 +124,8 @@ def _law(one: Candidate, values: Mapping[str, str]) -> str:
     names = _names(one, f"v_{first}" if pair else "v" if first != "v" else "dv/dt", f"v_{second}")
     names |= {"z": "z" if first != "z" else "z_hidden"} | dict(values)
     name = one.effect.name
+    if "memory" in values:
+        return _filled(_LAWS[name], names) + f", where {values['memory']}"
     if name in _LAWS:
         return _filled(_LAWS[name], names)
     if one.effect.acts_on == PARAMETER:
@@ -181,7 +183,7 @@ def _own_lines(one: Candidate, coefficients: Mapping[str, Any], unseen: str, mom
     if one.effect.name == "hidden_oscillator":
         square, kappa = number(coefficients["omega"] ** 2), number(coefficients["kappa"])
         return [f"d{unseen}/dt = P_{unseen}", f"dP_{unseen}/dt = -{square} {unseen} + {kappa} {one.targets[0]}"]
-    return []
+    return [coefficients["memory"]] if "memory" in coefficients else []
 
 
 def _parameter_lines(chosen: Sequence[tuple[Candidate, Mapping[str, Any]]]) -> list[str]:

@@ -11,6 +11,7 @@ from ._extended import Extended
 from ._found import Found
 from ._laws import laws, priced
 from ._locate import strained_coordinates
+from ._memories import memories
 from ._options import Options
 from ._outlook import Outlook
 from ._posterior import CONSISTENT, Posterior, posterior
@@ -53,6 +54,11 @@ def weigh_nameless(file: SimulationFile, recordings: Sequence[Recording], option
         begun.extend(known)
         _weigh_laws(search, begun.members(len(known)))
         known = _sharpened(search, begun, shapes, known)
+    if remembering := _that_fade(search, begun, strained_coordinates(outlooks)) if outlooks else []:
+        known = [*known, *remembering]
+        begun.extend(known)
+        _weigh_memories(search, begun.members(len(remembering)))
+    if known:
         _weigh_beside_laws(search, begun.members(len(known)))
     if not outlooks or not search.in_time() or not _is_open(_odds(search), search.found):
         return
@@ -87,6 +93,38 @@ def _weigh_laws(search: Search, members: Sequence[int]) -> None:
         first = [s for s in promising(search.along(members), _REACH) if s.combination not in found.estimates]
         if first:
             search.weigher.weigh(first)
+    _weigh_beside_remainders(search, members)
+
+
+def _that_fade(search: Search, begun: Extended, coordinates: Sequence[int]) -> list[Nameless]:
+    """Forces that fade, where one effect does not tell all; built in on every coordinate, or none."""
+    best = max(search.found.estimates, key=search.found.odds)
+    doubtful = len(best) > len(search.base) + 1 or _is_open(_odds(search), search.found)
+    if not (doubtful and search.in_time() and search.problem.equations.hidden):
+        return []
+    listed = memories(begun.file)
+    return listed if any(set(one.places) & set(coordinates) for one in begun.usable(listed)) else []
+
+
+def _weigh_memories(search: Search, members: Sequence[int]) -> None:
+    """Combinations of what was found and a force that fades, from where scores put them, or alone."""
+    search.progress("weighing forces that remember")
+    found, promises = search.found, dict[Combination, tuple[float, Start]]()
+    bases = [c for c in _leaders(search) if len(c) < MOST]
+    for c in bases:
+        white = found.of(c, "white")
+        assert white is not None  # leaders are weighed under white noise
+        for s in search.prospects.with_placed(c, members):
+            promise = white.log_evidence + s.gain + found.prices.log(s.combination)
+            if promise > promises.get(s.combination, (-np.inf, s))[0]:
+                promises[s.combination] = promise, s
+    starts = [s for _, s in sorted(promises.values(), key=lambda one: -one[0])[:_MOST]]
+    if starts:
+        search.weigher.weigh(starts, whole=True)
+    if alone := promising(search.along(members), _REACH):
+        search.weigher.weigh(alone)
+    search.refinement.move_places()
+    search.refinement.weigh_subsets()
     _weigh_beside_remainders(search, members)
 
 

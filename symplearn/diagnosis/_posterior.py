@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from .._effects import GAIN, HIDDEN, Oscillating
+from .._effects import GAIN, HIDDEN, Memory, Oscillating
 from ._constant import constant_evidence
 from ._found import Found, speaker
 from ._own_period import in_tune
@@ -202,11 +202,12 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
         shown = moved or bool((sd[amplitudes] < _UNINFORMED * scales).all())
         known &= moved or one.nameless is None
         if one.effect is HIDDEN:  # how it swings may be seen where how strongly it is joined is not
-            starts = np.stack([problem.unseen(r) for r in problem.members[member].recordings])
-            shown |= bool((sd[starts] < _UNINFORMED * found.priors.unseen).any())
+            shown |= bool((sd[problem.starts(member)] < _UNINFORMED * found.priors.unseen).any())
         known &= shown and not (one.effect is GAIN and abs(1.0 + best.z[place.start]) < _DEAD)
-        if one.effect is HIDDEN or isinstance(one.effect, Oscillating):
+        if one.effect is HIDDEN or isinstance(one.effect, (Oscillating, Memory)):
             known &= bool(best.z[place.stop - 1] > found.priors.lower[one.values.stop - 1])
+        if isinstance(one.effect, Memory):  # what fades at once is a loss that has a name
+            known &= bool(best.z[place.stop - 1] < found.priors.upper[one.values.stop - 1])
     return bool(np.isfinite(best.log_evidence) and known)
 
 

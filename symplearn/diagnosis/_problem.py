@@ -148,13 +148,13 @@ class Problem:
         return out
 
     def is_possible(self, combination: Sequence[int]) -> bool:
-        """Whether a combination can be simulated: each effect and target once, at most one unseen oscillator, one force
-        without a name on a coordinate, and no more values than there are slots."""
+        """Whether a combination can be simulated: each effect and target once, at most one unseen oscillator or force
+        that fades, one force without a name on a coordinate, and no more values than there are slots."""
         whole, ones = {self.whole(member) for member in combination}, [self.candidate(m) for m in combination]
-        hidden = sum(one.effect is HIDDEN for one in ones)
+        unseen = sum(one.effect.switched for one in ones)
         pushed = [i for one in ones if one.nameless for i in one.places]
         once = len(whole) == len(combination) and len(pushed) == len(set(pushed))
-        return once and len(ones) <= MOST and hidden <= 1 and sum(one.effect.size for one in ones) <= SLOTS
+        return once and len(ones) <= MOST and unseen <= 1 and sum(one.effect.size for one in ones) <= SLOTS
 
     def local(self, recording: int) -> Int[np.ndarray, " local"]:
         """Which entries of z one recording depends on."""
@@ -180,9 +180,7 @@ class Problem:
         free[self.head : self.slots] = True
         for member, place in self.placed(combination):
             free[place] = True
-            if self.candidate(member).effect is HIDDEN:
-                for r in self.members[member].recordings:
-                    free[self.unseen(r)] = True
+            free[self.starts(member)] = True
         return free
 
     def unseen(self, recording: int) -> Int[np.ndarray, "2"]:
@@ -190,9 +188,17 @@ class Problem:
         width = self.equations.width
         return recording * self.state + np.array([width - 1, 2 * width - 1])
 
+    def starts(self, member: int) -> Int[np.ndarray, "recording start"]:
+        """Where in z what a member adds unseen begins: an oscillator, or a force that fades, which has no place."""
+        effect, some = self.candidate(member).effect, self.members[member].recordings
+        if not effect.switched:
+            return np.zeros((len(some), 0), int)
+        return np.stack([self.unseen(r) for r in some])[:, 0 if effect is HIDDEN else 1 :]
+
     def moving(self, coefficients: Float[np.ndarray, " coefficient"]) -> Int[np.ndarray, " _"]:
-        """What one recording depends on before its slots: on an unseen oscillator's start only where there is one."""
-        present = coefficients[self.equations.firsts(HIDDEN) + HIDDEN.size].any() if self.equations.hidden else False
+        """What one recording depends on before its slots: on the start of what is unseen only where there is some."""
+        switches = [one.values.stop for one in self.equations.candidates if one.effect.switched]
+        present = coefficients[switches].any() if self.equations.hidden else False
         every = np.arange(self.state + self.calibrated.size)
         return every if present else np.setdiff1d(every, self.unseen(0) if self.equations.hidden else [])
 

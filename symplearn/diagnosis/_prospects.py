@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from .._effects import HIDDEN
 from ._calibrate import Fits, estimate_noise, residuals, weights
 from ._exchange import Regression
 from ._noisy import PathFit
@@ -48,13 +47,24 @@ class Prospects:
         return self._known[key]
 
     def along(self, path: PathFit, most: int, members: Sequence[int] | None = None) -> list[Start]:
-        """Starts of single effects about a path that a missing force bends: of all, or of some that have no place."""
+        """Starts of single effects about a path that a missing force bends: of all, or of some."""
         w = self.weigher
         if not np.isfinite(path.log_evidence):
             return []
-        units = self._units(most) if members is None else [Unit(m, None) for m in members]
+        units = self._units(most) if members is None else self._grids(members)
         grams = on_path(w.stepper, path, w.rows)
         return scan(w.problem, grams, path.z, w.base, w.found.priors, units)
+
+    def with_placed(self, combination: Combination, members: Sequence[int]) -> list[Start]:
+        """Starts of a fitted combination with one of some members, each of which is tried at all its places."""
+        w, fits = self.weigher, self._fitted(combination)
+        if fits is None:
+            return []
+        grams = on_trajectory(w.stepper, fits, 0, w.rows)
+        return scan(w.problem, grams, fits.z[0], combination, w.found.priors, self._grids(members))
+
+    def _grids(self, members: Sequence[int]) -> list[Unit]:
+        return [unit for m in members for unit in grid(self.weigher.problem, self.weigher.found.priors, m)]
 
     def exchanged(
         self, combination: Combination, most: int, size: int, number: int, beside: Estimate | None = None
@@ -73,7 +83,7 @@ class Prospects:
             is_placed = bool(problem.candidate(member).effect.places)
             units.setdefault(member, Unit(problem.whole(member), float(start.z[place]) if is_placed else None))
         some = {m: unit for m, unit in units.items() if problem.candidate(m).effect.amplitudes and m not in combination
-                and problem.candidate(m).effect is not HIDDEN}  # fmt: skip
+                and not problem.candidate(m).effect.switched}  # fmt: skip
         if not some:
             return []
         whiten = whitening(problem, fits, w.rows, beside) if beside else None

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from .._effects import HIDDEN, STOP
+from .._effects import STOP, Memory
 from ._depths import along_the_depths
 from ._driven import as_driven
 from ._found import Found, speaker
@@ -24,6 +24,8 @@ _MOVED, _NEAR = 3, 8.0
 _SOFT, _STIFFER = 100.0, 20
 # Standard deviations between places of one effect in two fits that stopped at different ones.
 _ELSEWHERE = 3.0
+# Steps of what fades, as shares of how fast it does.
+_FADING = 0.25
 # Combinations like the best of a size that are fitted, and how far behind a regression may see them.
 _ALIKE, _BEHIND = 8, 30.0
 
@@ -115,7 +117,7 @@ class Refinement:
         found = []
         for size in range(1, MOST + 1):
             mine = [c for c in ranked if len(c) == size and c != self.weigher.base]
-            seen = [c for c in mine if all(self.problem.candidate(m).effect is not HIDDEN for m in c)]
+            seen = [c for c in mine if not any(self.problem.candidate(m).effect.switched for m in c)]
             found += [*mine[:1], *seen[:1]]
         return list(dict.fromkeys(found))
 
@@ -153,7 +155,7 @@ class Refinement:
     def _moved(self, z: np.ndarray, member: int, entry: int) -> list[np.ndarray]:
         one, priors = self.problem.candidate(member), self.found.priors
         low, high = priors.lower[one.values.stop - 1], priors.upper[one.values.stop - 1]
-        step = spacing(one, low, high)
+        step = _FADING * z[entry] if isinstance(one.effect, Memory) else spacing(one, low, high)
         out = []
         for k in (-3, -1, 1, 3):
             if low < z[entry] + k * step < high:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import _effects as effects
-from .._effects import Candidate, Oscillating
+from .._effects import Candidate, Memory, Oscillating
 from ._arrow import MANY
 from ._calibrate import Fits, Priors, residuals, weights
 from ._noisy import PathFit, lane_grams
@@ -22,6 +22,8 @@ from ._trajectory import DIRECTIONS, LANES, Stepper
 
 # Places tried for times, and the most frequencies; frequencies this many times pi over the span apart.
 _TIMES, _FREQUENCIES, _SPACING = 60, 160, 0.8
+# How fast a force fades, evenly spread in the logarithm.
+_FADINGS = 12
 # How far inside the motion a stop is tried, as shares of the way from its edge to its middle.
 _DEPTHS = np.geomspace(0.01, 0.9, 12)
 # Unseen oscillators that are scored at once.
@@ -46,6 +48,8 @@ def _places(one: Candidate, low: float, high: float) -> np.ndarray:
         # Evenly spaced as far as they go, which is what the span resolves; then ever wider.
         even = np.linspace(low, high, number)
         return even if high - low <= step * _FREQUENCIES else np.geomspace(low, high, number)
+    if isinstance(one.effect, Memory):
+        return np.geomspace(low, high, _FADINGS + 2)[1:-1]
     if one.effect is effects.STOP:
         return high - (high - low) * _DEPTHS if one.side == "upper" else low + (high - low) * _DEPTHS
     return low + (high - low) * (np.arange(_TIMES) + 0.5) / _TIMES
@@ -75,7 +79,7 @@ def packed(problem: Problem, units: Sequence[Unit]) -> Iterator[list[Unit]]:
 
 def _fits(problem: Problem, lane: list[Unit], unit: Unit) -> bool:
     ones = [problem.equations.candidates[u.candidate] for u in (*lane, unit)]
-    unseen = sum(one.effect is effects.HIDDEN for one in ones)
+    unseen = sum(one.effect.switched for one in ones)
     directions = sum(one.effect.amplitudes for one in ones) + 2 * unseen
     size = sum(one.effect.size for one in ones)
     once = unit.candidate not in {u.candidate for u in lane}
@@ -121,7 +125,7 @@ def on_trajectory(stepper: Stepper, fits: Fits, lane: int, rows: Sequence[int]) 
             for b, (units, (_, _, amplitudes)) in enumerate(zip(lanes, laid, strict=True)):
                 for u, unit in enumerate(units):
                     own = known
-                    if problem.equations.candidates[unit.candidate].effect is effects.HIDDEN:
+                    if problem.equations.candidates[unit.candidate].effect.switched:
                         own = known.copy()
                         own[_unseen(problem)] = slopes[b][_unseen(problem)]
                     further = slopes[b][unknown + amplitudes[u]]
@@ -188,7 +192,7 @@ def scan(
             others = nuisance(problem, by_recording, z, combination, priors) if others is None else others
             for member in _members(problem, unit, combination):
                 tried.append(response(problem, by_recording, unit, member))
-                if problem.candidate(member).effect is effects.HIDDEN:
+                if problem.candidate(member).effect.switched:
                     some = waiting.setdefault(member, {})
                     some[len(tried) - 1] = by_recording
                     if len(some) == together:

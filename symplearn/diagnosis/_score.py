@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .. import _effects as effects
 from ._arrow import LEAST, MANY, Arrow
 from ._calibrate import Priors
 from ._problem import Combination, Problem
@@ -65,13 +64,8 @@ def unseen_nuisance(
 ) -> Nuisance:  # fmt: skip
     """That of an unseen oscillator's units, whose start is unknown too, beside that of every other effect."""
     found = _remaining(problem, lanes, z, combination, priors, member)
-    width = priors.precision_of(problem, (member,))[_starts(problem, member)]
+    width = priors.precision_of(problem, (member,))[problem.starts(member).ravel()]
     return found._replace(gain=found.earned - others.earned + float(0.5 * np.log(width).sum()))
-
-
-def _starts(problem: Problem, member: int) -> np.ndarray:
-    """Where in z an unseen oscillator begins."""
-    return np.concatenate([problem.unseen(r) for r in problem.members[member].recordings])
 
 
 def _remaining(
@@ -81,7 +75,7 @@ def _remaining(
     """All unknowns of a combination, and the start of what one further member adds `unseen`."""
     active, precision = problem.active(combination), priors.precision_of(problem, combination)
     if unseen is not None:
-        starts = _starts(problem, unseen)
+        starts = problem.starts(unseen).ravel()
         active[starts] = True
         precision[starts] = priors.precision_of(problem, (unseen,))[starts]
     found, spread, push = _inverted(problem, lanes, precision, active)
@@ -186,7 +180,7 @@ def scores(
         amplitudes, lowest = np.maximum(amplitudes, 0.0), np.zeros(number)
     gains = others.gain + 0.5 * (push * amplitudes).sum(1) + 0.5 * np.linalg.slogdet(spread)[1] - np.log(scales).sum(1)
     steps = others.step - np.einsum("lza,la->lz", after, amplitudes)
-    if effect is effects.HIDDEN:
+    if effect.switched:
         (member,) = {one.member for one in responses}
         gains += _unseen_strengths(problem, member, priors, others, after, amplitudes, spread, steps)
     else:
@@ -205,10 +199,11 @@ def _unseen_strengths(
     steps: Float[np.ndarray, "lane active"],
 ) -> Float[np.ndarray, " lane"]:  # fmt: skip
     """What unseen oscillators gain for being of any strength: their amplitude and their start together."""
-    some = np.isin(np.nonzero(others.active)[0], _starts(problem, member))
+    starts = problem.starts(member).ravel()
+    some = np.isin(np.nonzero(others.active)[0], starts)
     scales = np.append(
         priors.scales[problem.candidate(member).first],
-        priors.precision_of(problem, (member,))[_starts(problem, member)] ** -0.5,
+        priors.precision_of(problem, (member,))[starts] ** -0.5,
     )
     follow = after[:, some]
     cross = -follow @ spread

@@ -164,7 +164,7 @@ class Search:
             self.seed = min(starts, key=lambda z: float((((z - best.z)[:head] / spread) ** 2).sum()))
 
     def along(self, members: Sequence[int]) -> list[Start]:
-        """Where each of some effects without a place begins alone, by the force that the simulation misses."""
+        """Where each of some effects begins alone, by the force that the simulation misses."""
         return self.prospects.along(self._null, 1, members)
 
     @property

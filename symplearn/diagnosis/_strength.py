@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import log_ndtr, logsumexp
 from scipy.stats import norm
 
-from .._effects import EXCITATION, HIDDEN
+from .._effects import EXCITATION
 from ._activity import log_fed
 from ._calibrate import Priors
 from ._evidence import log_density, orthants
@@ -106,9 +106,8 @@ def turning_gain(centre: np.ndarray, spread: np.ndarray, scales: np.ndarray, alo
 def strength_entries(problem: Problem, combination: Combination, member: int) -> Int[np.ndarray, " entry"]:
     """Where in z the amplitudes of one member stand, and the start of what it adds unseen."""
     place = dict(problem.placed(combination))[member]
-    effect = problem.candidate(member).effect
-    unseen = [problem.unseen(r) for r in problem.members[member].recordings] if effect is HIDDEN else []
-    return np.concatenate([np.arange(place.start, place.start + effect.amplitudes), *unseen]).astype(int)
+    amplitudes = np.arange(place.start, place.start + problem.candidate(member).effect.amplitudes)
+    return np.concatenate([amplitudes, problem.starts(member).ravel()])
 
 
 def mixture_gain(
