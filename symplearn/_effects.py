@@ -149,17 +149,21 @@ class HiddenOscillator(Effect):
 
 @dataclass(frozen=True)
 class Memory(Effect):
-    """A force w against the motion that fades: dw/dt = kappa v - fading w, or - fading |v| w where it fades `by_way`.
+    """A force w against the motion that fades: dw/dt = kappa v - w / tau, or - |v| w / a where it fades `by_way`.
 
     With time it is a spring and a damper in series (Maxwell 1867), with the way a friction that gives at first (Dahl
-    1968). w takes the place of an unseen oscillator's momentum, and its start is as open.
+    1968). Inside, the last value is 1 / tau or 1 / a. w takes the place of an unseen oscillator's momentum, and its
+    start is as open.
     """
 
     by_way: bool = False
 
     @property
     def coefficients(self) -> tuple[str, ...]:
-        return "kappa", "fading"
+        return "kappa", "a" if self.by_way else "tau"
+
+    def named(self, values: Values, origin: float) -> dict[str, Any]:
+        return dict(zip(self.coefficients, (values[..., 0], 1 / values[..., 1]), strict=True))
 
     @property
     def kept_as(self) -> str:

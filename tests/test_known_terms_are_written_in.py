@@ -129,7 +129,17 @@ def rubbed():
     return solved(rates, START, TIMES, 1e-10)[:, :2]
 
 
+def remembered():
+    """A force -w on x with dw/dt = 0.8 v - w / 0.5 - a friend's share, which another number in it remembers."""
+    rates = lambda t, s: [  # noqa: E731
+        s[2], s[3], -K * s[0] - s[4], -s[1], 0.8 * s[2] - 2 * s[4] - s[5], 0.3 * s[4] - s[5]]  # fmt: skip
+    return solved(rates, [*START, 0.0, 0.0], TIMES, 1e-10)[:, :2]
+
+
 SOLVED = {
+    'effect = "unnamed_force"\ntarget = "x"\nexpression = "-w"\nmemory = { w = "0.8*p - 2*w - u", u = "0.3*w - u" }': (
+        remembered
+    ),
     'effect = "impulse"\ntarget = "x"\nj = 0.4\nt_star = 4.321': kicked,
     'effect = "hidden_oscillator"\ntarget = "x"\nomega = 1.3\nkappa = 0.8': coupled,
     'effect = "coulomb_friction"\ntarget = "y"\nf = 0.02': rubbed,

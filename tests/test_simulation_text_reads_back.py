@@ -65,6 +65,11 @@ a = 2
 effect = "coupling_spring"
 target = ["y", "x"]
 k = 2
+[[terms]]
+effect = "unnamed_force"
+target = "y"
+expression = "-w"
+memory = { w = "2*x - w" }
 '''
 SHORT = """
 [system]
@@ -101,6 +106,7 @@ def test_every_section_is_read():
     assert [t.effect for t in simulation.terms][::3] == ["gyroscopic_coupling", "coupling_spring"]
     assert simulation.terms[0].recordings == (1, 3) and simulation.terms[2].side == "lower"
     assert simulation.terms[3].target == ("x", "y")  # sorted into the order of the coordinates
+    assert simulation.terms[4].memory["w"].text == "2*x - w" and not simulation.terms[1].memory
     assert simulation.unknowns == 3 and simulation.unknown_states == 3
     assert simulation.hamiltonian.text.startswith("p**2/2 + r**2/(2*m)\n")
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .._effects import COORDINATE, IMPULSE, OUTLIERS, PAIR, Candidate
+from .._effects import COORDINATE, IMPULSE, MEMORIES, OUTLIERS, PAIR, Candidate
 from .._expression import Expression
 from . import _document as document
 from ._along import along, energy, force
@@ -283,10 +283,10 @@ class Answer:
         return document.finite(mine - without)
 
     def _strength(self, member: int) -> float | None:
-        """An effect's amplitudes by their prior's scales, in shares of the forces already there; None for no force, and
-        where none is there."""
+        """An effect's amplitudes by their prior's scales, in shares of the forces already there; None for no force, for
+        one that fades, and where none is there."""
         one, place = self.problem.candidate(member), dict(self.problem.placed(self.after.combination))[member]
-        if one.effect.acts_on != COORDINATE or not self._there[:, one.place].any():
+        if one.effect.acts_on != COORDINATE or one.effect in MEMORIES or not self._there[:, one.place].any():
             return None
         amplitudes = self.after.z[place][: one.effect.amplitudes]
         scales = self.found.priors.scales[one.first : one.first + one.effect.amplitudes]

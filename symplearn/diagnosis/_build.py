@@ -72,7 +72,7 @@ def augmented_equations(
             mechanics(file, start),
             [symbol(name) for name in file.parameters],
             [symbol(name) for name in file.recording.inputs],
-            hidden=restriction.has(HIDDEN),
+            hidden=restriction.has(HIDDEN) or restriction.has(UNNAMED),  # what a force remembers takes its place
             delayed=delayed or restriction.has(DELAY),
             origin=origin,
             nameless=nameless,

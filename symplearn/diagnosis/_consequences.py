@@ -192,11 +192,26 @@ def _errs(said: Said) -> str:
 
 
 def _is_nameless(said: Said) -> str:
+    if "tau" in said.coefficients or "a" in said.coefficients:
+        return _fades(said)
     sd = said.coefficients.get("relative_sd")
     known = "" if sd is None else f"Its size is known to {number(100 * sd)} % (one standard deviation). "
     if said.one.nameless is not None and said.one.nameless.words:
         return f"{known}It is the likeliest of the simple laws that were tried, and holds where the motion has been."
     return f"{known}Its form was fitted to the missing force and holds where the motion has been, not beyond."
+
+
+def _fades(said: Said) -> str:
+    """What it is at first, and in the long run."""
+    if "tau" in said.coefficients:
+        return (
+            f"What takes much less time than tau feels a spring of kappa, what takes longer a damper of kappa tau = "
+            f"{number(said.mean('kappa') * said.mean('tau'))}; most energy is lost where omega tau = 1."
+        )
+    return (
+        "On ways much shorter than a it is a spring of kappa, on longer ones a friction of "
+        f"kappa a = {number(said.mean('kappa') * said.mean('a'))}: it runs through a loop (hysteresis)."
+    )
 
 
 def _same(text: str) -> Callable[[Said], str]:

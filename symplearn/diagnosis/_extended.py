@@ -68,7 +68,8 @@ class Extended:
     def _span(self, force: Nameless) -> Span | None:
         if force.memory is None:
             return None
-        return fading(force.memory, self._along(force.places[0]), [r.times for r in self.search.problem.rows])
+        q, rows = self._along(force.places[0]), self.search.problem.rows
+        return fading(force.memory, q, [r.times[: len(one)] for r, one in zip(rows, q, strict=True)])
 
     def _along(self, i: int) -> list[Float[np.ndarray, " row"]]:
         """A coordinate along the motion that every prior of an effect comes from, by recording."""

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from .._effects import Candidate
+from .._effects import Candidate, Memory
 from .._vocabulary import COLUMN, PAIR, PARAMETER, symbol
 
 # What each effect adds to the force on its first and second coordinate (contract, section 3).
@@ -53,6 +53,11 @@ _LAWS = {
     "sensor_drift": "y = h(x) + {r} (t - t_0)",
     "sensor_delay": "y(t) = h(x(t - {tau}))",
     "sensor_outliers": "a fraction {e} of the readings is off, with standard deviation {sd}",
+}
+# Of forces that fade, by the way or not.
+_FADING = {
+    False: "F = -{w}, d{w}/dt = {kappa} {v} - {w} / {tau}",
+    True: "F = -{w}, d{w}/dt = {kappa} {v} - |{v}| {w} / {a}",
 }
 
 
@@ -122,10 +127,10 @@ def _law(one: Candidate, values: Mapping[str, str]) -> str:
     first, second = one.targets[0], one.targets[-1]
     pair = one.effect.acts_on == PAIR
     names = _names(one, f"v_{first}" if pair else "v" if first != "v" else "dv/dt", f"v_{second}")
-    names |= {"z": "z" if first != "z" else "z_hidden"} | dict(values)
+    names |= {"z": "z" if first != "z" else "z_hidden", "w": "w" if first != "w" else "w_force"} | dict(values)
     name = one.effect.name
-    if "memory" in values:
-        return _filled(_LAWS[name], names) + f", where {values['memory']}"
+    if isinstance(one.effect, Memory):
+        return _filled(_FADING[one.effect.by_way], names)
     if name in _LAWS:
         return _filled(_LAWS[name], names)
     if one.effect.acts_on == PARAMETER:

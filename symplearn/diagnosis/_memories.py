@@ -40,7 +40,7 @@ class Span:
     high: float
 
 
-def fading(memory: Memory, q: Sequence[Float[np.ndarray, " row"]], times: Sequence[Float[np.ndarray, " row"]]) -> Span:
+def fading(memory: Memory, q: Sequence[Float[np.ndarray, " _"]], times: Sequence[Float[np.ndarray, " _"]]) -> Span:
     """How fast a force may fade: from once in a recording to what its rows show; by recording."""
     if memory.by_way:
         way = max(float(np.ptp(one)) for one in q)
@@ -49,7 +49,7 @@ def fading(memory: Memory, q: Sequence[Float[np.ndarray, " row"]], times: Sequen
     return Span(1 / span, max(np.pi / (2 * gap), 2 / span))
 
 
-def stiffness(force: float, q: Sequence[Float[np.ndarray, " row"]]) -> float:
+def stiffness(force: float, q: Sequence[Float[np.ndarray, " _"]]) -> float:
     """What gives as much force as is there."""
     return force / rms(np.concatenate([one - one.mean() for one in q]))
 
@@ -64,6 +64,6 @@ def written_memory(
     )
     momentum = file.momenta[file.coordinates.index(coordinate)]
     w, v = symbol(name), derivative(file.hamiltonian.tree, file.symbols[momentum])
-    kappa, rate = (sympy.Float(float(f"{value:.6g}"), 8) for value in values)
-    tree = kappa * v - rate * w * (Absolute(v) if memory.by_way else 1)
+    kappa, lasting = (sympy.Float(float(f"{value:.6g}"), 8) for value in values)
+    tree = kappa * v - w * (Absolute(v) if memory.by_way else 1) / lasting
     return Expression(str(-w), -w), {name: Expression(str(tree), tree)}

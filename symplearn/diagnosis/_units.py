@@ -32,6 +32,9 @@ _UNITS: dict[tuple[str, str], _Powers] = {
     ("regime_change", "d"): {},
     ("regime_change", "t_star"): {"t": 1},
     ("hidden_oscillator", "omega"): {"angle": 1, "t": -1},
+    ("unnamed_force", "kappa"): {"p": 1, "q": -1, "t": -1},
+    ("unnamed_force", "tau"): {"t": 1},
+    ("unnamed_force", "a"): {"q": 1},
     ("parameter_error", "d"): {},
     ("sensor_noise", "s"): {},
     ("sensor_bias", "b"): {"y": 1},
@@ -68,7 +71,8 @@ def coefficient_units(
     else:
         known |= {"q": units.get(first), "q2": units.get(second), "p": units.get(momenta.get(first, ""))}
     alike = effect not in _ALIKE or known["q"] == known["q2"]
-    return {name: _unit(effect, name, known) if alike else None for name in VOCABULARY[effect].coefficients}
+    names = VOCABULARY[effect].coefficients or [name for one, name in _UNITS if one == effect]
+    return {name: _unit(effect, name, known) if alike else None for name in names}
 
 
 def time_unit(units: Mapping[str, str], column: str) -> str | None:

@@ -138,9 +138,8 @@ def _share_of_forces(effect: str, strength: float | None) -> float | None:
 def _law_with_numbers(said: Said) -> str:
     """`F = -c v, where c = 0.03 +- 0.002 N`."""
     names = symbols(said.one)
-    if "expression" in said.coefficients:
-        texts = {name: text for name, text in said.coefficients.items() if isinstance(text, str)}
-        return law_text(said.one, texts)
+    if not names:
+        return law_text(said.one, {"expression": said.coefficients["expression"]})
     values = [f"{shown} = {said.value(name)}" for name, shown in names.items()]
     return f"{symbolic_law(said.one)}, where {_listed(values, 'and')}"
 
