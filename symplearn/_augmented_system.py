@@ -131,9 +131,9 @@ class SimulatedHamiltonian(ig.AbstractHamiltonian):
             kappa, fading, here = (self.of(effect, k) for k in range(3))
             present = present + here
             gained = gained + (kappa * v).sum()
-            lost = lost + (here * fading * (jnp.abs(v) if effect.by_way else 1.0)).sum()
+            lost = lost + (here * fading * effect.lost(v, jnp.abs(v), w, jnp.abs(w))).sum()
         pushed = force - w * jnp.pad(present, (0, len(force) - len(v)))
-        return jnp.concatenate([pushed, (gained - lost * w)[None]])
+        return jnp.concatenate([pushed, (gained - lost)[None]])
 
     def _between(self, v: Float[Array, " declared"]) -> Float[Array, " declared"]:
         """Forces between pairs of coordinates that a velocity enters."""

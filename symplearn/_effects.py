@@ -149,14 +149,16 @@ class HiddenOscillator(Effect):
 
 @dataclass(frozen=True)
 class Memory(Effect):
-    """A force w against the motion that fades: dw/dt = kappa v - w / tau, or - |v| w / a where it fades `by_way`.
+    """A force w against the motion that fades: dw/dt = kappa v - w / tau, or - |v| w / a where it fades `by_way`, or
+    - (|v| w + v |w|) / 2a where only while it is loaded, and is `elastic` when it is let go.
 
     With time it is a spring and a damper in series (Maxwell 1867), with the way a friction that gives at first (Dahl
-    1968). Inside, the last value is 1 / tau or 1 / a. w takes the place of an unseen oscillator's momentum, and its
-    start is as open.
+    1968) or a part that yields (Bouc 1967 and Wen 1976, of order one). Inside, the last value is 1 / tau or 1 / a. w
+    takes the place of an unseen oscillator's momentum, and its start is as open.
     """
 
     by_way: bool = False
+    elastic: bool = False
 
     @property
     def coefficients(self) -> tuple[str, ...]:
@@ -167,7 +169,13 @@ class Memory(Effect):
 
     @property
     def kept_as(self) -> str:
-        return f"{self.name}, {'by way' if self.by_way else 'by time'}"
+        return f"{self.name}, {'loaded' if self.elastic else 'by way' if self.by_way else 'by time'}"
+
+    def lost(self, speed: Any, absolute: Any, force: Any, size: Any) -> Any:
+        """What fades of a force of some size, where one over tau or a is one, at a speed and its absolute value."""
+        if self.elastic:
+            return (absolute * force + speed * size) / 2
+        return absolute * force if self.by_way else force
 
 
 VISCOUS = Drag("viscous_damping", positive=True, power=1)
@@ -203,9 +211,10 @@ OUTLIERS = Effect("sensor_outliers", amplitudes=0)
 # Beside the powers these shape a force of place that has no word; they are never reported.
 SHAPES = (PowerForce("quartic_stiffness", power=4), PowerForce("quintic_stiffness", power=5))
 UNNAMED = Effect("unnamed_force")  # its amplitudes are as many as its terms
-RELAXING, SLIPPING = MEMORIES = (
+RELAXING, SLIPPING, YIELDING = MEMORIES = (
     Memory("unnamed_force", places=("fading",), positive=True, switched=True),
     Memory("unnamed_force", places=("fading",), positive=True, switched=True, by_way=True),
+    Memory("unnamed_force", places=("fading",), positive=True, switched=True, by_way=True, elastic=True),
 )
 
 ON_COORDINATES = (*POWERS, VISCOUS, QUADRATIC, COULOMB, EXCITATION, STOP, FORCING, IMPULSE, HIDDEN)

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from .._effects import Candidate, Memory
+from .._effects import RELAXING, SLIPPING, YIELDING, Candidate, Memory
 from .._vocabulary import COLUMN, PAIR, PARAMETER, symbol
 
 # What each effect adds to the force on its first and second coordinate (contract, section 3).
@@ -54,10 +54,11 @@ _LAWS = {
     "sensor_delay": "y(t) = h(x(t - {tau}))",
     "sensor_outliers": "a fraction {e} of the readings is off, with standard deviation {sd}",
 }
-# Of forces that fade, by the way or not.
+# What forces that fade change by.
 _FADING = {
-    False: "F = -{w}, d{w}/dt = {kappa} {v} - {w} / {tau}",
-    True: "F = -{w}, d{w}/dt = {kappa} {v} - |{v}| {w} / {a}",
+    RELAXING: "{kappa} {v} - {w} / {tau}",
+    SLIPPING: "{kappa} {v} - |{v}| {w} / {a}",
+    YIELDING: "{kappa} {v} - (|{v}| {w} + {v} |{w}|) / (2 {a})",
 }
 
 
@@ -130,7 +131,7 @@ def _law(one: Candidate, values: Mapping[str, str]) -> str:
     names |= {"z": "z" if first != "z" else "z_hidden", "w": "w" if first != "w" else "w_force"} | dict(values)
     name = one.effect.name
     if isinstance(one.effect, Memory):
-        return _filled(_FADING[one.effect.by_way], names)
+        return _filled(f"F = -{{w}}, d{{w}}/dt = {_FADING[one.effect]}", names)
     if name in _LAWS:
         return _filled(_LAWS[name], names)
     if one.effect.acts_on == PARAMETER:

@@ -7,7 +7,7 @@ import numpy as np
 import sympy
 from jaxtyping import Float
 
-from .._effects import MEMORIES, Memory, Nameless
+from .._effects import MEMORIES, RELAXING, SLIPPING, YIELDING, Memory, Nameless
 from .._expression import Expression, symbol
 from .._kinks import Absolute
 from .._simulation_records import SimulationFile
@@ -19,17 +19,18 @@ _SHARE = 0.25
 # What fades with the way does so within twice the whole swing, or a twentieth of it.
 _WAYS = 0.5, 20.0
 _WORDS = {
-    False: "remembers: it grows against the motion of {q} and fades with time, as of a spring and a damper in series",
-    True: "remembers: it grows against the motion of {q} and fades with the way gone, as where a friction gives before "
-    "it slips",
+    RELAXING: "fades with time, as of a spring and a damper in series",
+    SLIPPING: "fades with the way gone, as where a friction gives before it slips",
+    YIELDING: "fades with the way gone while it is loaded, as of a part that yields",
 }
 
 
 def memories(file: SimulationFile) -> list[Nameless]:
     """Every force that fades, on every coordinate, each one choice of all."""
     choices = float(np.log(len(MEMORIES) * len(file.coordinates) / _SHARE))
-    return [Nameless((i,), (), choices, _WORDS[memory.by_way].format(q=q), "dissipation", memory)
-            for memory in MEMORIES for i, q in enumerate(file.coordinates)]  # fmt: skip
+    listed = [(i, f"remembers: it grows against the motion of {q} and {words}", memory)
+              for memory, words in _WORDS.items() for i, q in enumerate(file.coordinates)]  # fmt: skip
+    return [Nameless((i,), (), choices, words, "dissipation", memory) for i, words, memory in listed]
 
 
 @dataclass(frozen=True)
@@ -65,5 +66,5 @@ def written_memory(
     momentum = file.momenta[file.coordinates.index(coordinate)]
     w, v = symbol(name), derivative(file.hamiltonian.tree, file.symbols[momentum])
     kappa, lasting = (sympy.Float(float(f"{value:.6g}"), 8) for value in values)
-    tree = kappa * v - w * (Absolute(v) if memory.by_way else 1) / lasting
+    tree = kappa * v - memory.lost(v, Absolute(v), w, Absolute(w)) / lasting
     return Expression(str(-w), -w), {name: Expression(str(tree), tree)}
