@@ -125,7 +125,7 @@ def _range(motion: Motion, one: Candidate) -> tuple[float, float]:
 
 
 def with_nameless(
-    problem: Problem, priors: Priors, scales: Sequence[Float[np.ndarray, " amplitude"]], spans: Sequence[Span | None]
+    problem: Problem, priors: Priors, scales: Sequence[Float[np.ndarray, " _"]], spans: Sequence[Span | None]
 ) -> Priors:
     """Priors with those of forces without a name, which stand last, behind all that has some already: `scales` of their
     amplitudes, in their order, and between what the fading of each lies that fades."""

@@ -49,7 +49,7 @@ class Extended:
         every = len(self.search.problem.equations.candidates)
         return range(every - number, every)
 
-    def _scales(self, forces: Sequence[Nameless]) -> list[Float[np.ndarray, " amplitude"]]:
+    def _scales(self, forces: Sequence[Nameless]) -> list[Float[np.ndarray, " _"]]:
         """Prior scales of their amplitudes: as strong as every other effect where it is strongest; what fades, as if it
         did not."""
         sizes = iter(self._sizes([term for force in forces for terms in force.pushes for term in terms]))

@@ -50,15 +50,14 @@ def weigh_nameless(file: SimulationFile, recordings: Sequence[Recording], option
     begun, outlooks = Extended(file, recordings, options, search), _outlooks(search)
     shapes = Shapes(file, outlooks)
     known = [*priced(begun.usable(laws(file))), *begun.usable(shapes.first())]
+    number, known = len(known), [*known, *(_that_fade(search, begun, outlooks) if _is_doubtful(search) else [])]
     if known:
         begun.extend(known)
-        _weigh_laws(search, begun.members(len(known)))
+        members = begun.members(len(known))
+        _weigh_laws(search, members[:number])
+        if len(known) > number and _is_doubtful(search):
+            _weigh_memories(search, members[number:])
         known = _sharpened(search, begun, shapes, known)
-    if remembering := _that_fade(search, begun, strained_coordinates(outlooks)) if outlooks else []:
-        known = [*known, *remembering]
-        begun.extend(known)
-        _weigh_memories(search, begun.members(len(remembering)))
-    if known:
         _weigh_beside_laws(search, begun.members(len(known)))
     if not outlooks or not search.in_time() or not _is_open(_odds(search), search.found):
         return
@@ -96,14 +95,17 @@ def _weigh_laws(search: Search, members: Sequence[int]) -> None:
     _weigh_beside_remainders(search, members)
 
 
-def _that_fade(search: Search, begun: Extended, coordinates: Sequence[int]) -> list[Nameless]:
-    """Forces that fade, where one effect does not tell all; built in on every coordinate, or none."""
+def _is_doubtful(search: Search) -> bool:
+    """Whether the likeliest answer has more than one effect, or is open."""
     best = max(search.found.estimates, key=search.found.odds)
-    doubtful = len(best) > len(search.base) + 1 or _is_open(_odds(search), search.found)
-    if not (doubtful and search.in_time() and search.problem.equations.hidden):
-        return []
+    return search.in_time() and (len(best) > len(search.base) + 1 or _is_open(_odds(search), search.found))
+
+
+def _that_fade(search: Search, begun: Extended, outlooks: Sequence[Outlook]) -> list[Nameless]:
+    """Forces that fade: on every coordinate of the file, or on none, where one is taken already."""
     listed = memories(begun.file)
-    return listed if any(set(one.places) & set(coordinates) for one in begun.usable(listed)) else []
+    usable = bool(outlooks) and len(begun.usable(listed)) == len(listed)
+    return listed if usable and search.problem.equations.hidden else []
 
 
 def _weigh_memories(search: Search, members: Sequence[int]) -> None:
@@ -123,8 +125,10 @@ def _weigh_memories(search: Search, members: Sequence[int]) -> None:
         search.weigher.weigh(starts, whole=True)
     if alone := promising(search.along(members), _REACH):
         search.weigher.weigh(alone)
-    search.refinement.move_places()
-    search.refinement.weigh_subsets()
+    best = max(found.estimates, key=found.odds)
+    if set(best) & set(members):
+        search.refinement.move_places()
+        search.refinement.weigh_subsets()
     _weigh_beside_remainders(search, members)
 
 

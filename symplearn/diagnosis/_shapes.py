@@ -15,6 +15,7 @@ from .._symbolic import derivative
 from ._along import along, force
 from ._locate import strained_coordinates
 from ._outlook import Outlook
+from ._sweeps import Sweep, swept
 from ._unnamed import along_outlooks, missing, points
 
 # Knees, as shares of how far the coordinate goes; teeth in a turn, or waves in a swing; places of the swing and widths,
@@ -25,6 +26,8 @@ _PLACES, _WIDTHS = np.linspace(0.05, 0.95, 19), np.geomspace(0.03, 0.25, 5)
 # explain, beside what a constant, the place and the speed do. What is smoothed shows the sharp ones too little. Of all
 # families so many, those that explain most.
 _FIRST, _APART, _EXPLAINED, _MOST = 3, 3, 0.05, 12
+# How far the frequencies of a sweep are moved each way: by steps that shift the phase at one end by so many cycles.
+_EITHER_WAY, _APART_IN_PHASE = 8, 0.05
 # Share of the prior of what has no name that all families have, beside that of simple laws.
 _SHARE = 0.25
 # Forces that are the same but for round-off.
@@ -38,20 +41,25 @@ class Family:
     """Laws on one coordinate that differ in nothing but their shape: the numbers that `law` takes, each from an axis.
 
     A place is one index for each axis, between two of which shapes are interpolated, unless the numbers are `counts`.
+    With `choices` its middle was chosen from so many already (their logarithm), and is where it begins.
     """
 
     law: Callable[..., Nameless]
     axes: tuple[Float[np.ndarray, " _"], ...]
     counts: bool = False
+    choices: float | None = None
 
     def places(self) -> list[Place]:
         """Of the grid."""
+        if self.choices is not None:
+            return [tuple((len(axis) - 1) / 2 for axis in self.axes)]
         return [tuple(map(float, place)) for place in product(*(range(len(axis)) for axis in self.axes))]
 
     def at(self, place: Place, step: float = 1.0) -> Nameless:
         """One law, chosen from as many as there are that far apart."""
         shape = [float(np.interp(x, np.arange(len(axis)), axis)) for x, axis in zip(place, self.axes, strict=True)]
-        return replace(self.law(*shape), choices=float(sum(np.log(len(axis) / step) for axis in self.axes)))
+        choices = sum(np.log(len(axis)) for axis in self.axes) if self.choices is None else self.choices
+        return replace(self.law(*shape), choices=float(choices - len(self.axes) * np.log(step)))
 
     def first(self, shares: Float[np.ndarray, " place"]) -> list[Place]:
         """Those of the grid that explain most, some steps apart."""
@@ -124,7 +132,15 @@ class Shapes:
             if low < high:
                 some = [_saturating(i, name, q, max(-low, high))]
                 some += [_cogging(i, name, q)] if turning[i] else _in_a_swing(i, name, q, v, low, high)
+                some += self._sweeping(i, name) if len(self.outlooks) == 1 else []
                 yield from ((family, i) for family in some)
+
+    def _sweeping(self, i: int, name: str) -> list[Family]:
+        """Of one recording: clocks of several begin anew."""
+        (o,) = self.outlooks
+        push, plain = missing(self.outlooks)[:, i], along_outlooks(self.file, _plain(self.file, i), self.outlooks)
+        found = [swept(o.rows.times[: len(push)], push, plain, grows) for grows in (False, True)]
+        return [_sweep(i, name, *one) for one in found if one]
 
 
 def _plain(file: SimulationFile, i: int) -> tuple[sympy.Expr, sympy.Expr, sympy.Expr]:
@@ -177,6 +193,18 @@ def _in_a_swing(i: int, name: str, q: sympy.Expr, v: sympy.Expr, low: float, hig
         return near, apart, f"about {name} = {place} alone, within {width:g}"
 
     return [Family(wave, (_WAVES,)), Family(brake, (_PLACES, _WIDTHS)), Family(hollow, (_PLACES, _WIDTHS))]
+
+
+def _sweep(i: int, name: str, middle: Sweep, number: int) -> Family:
+    def law(first: float, last: float) -> Nameless:
+        moved = replace(middle, first=_rounded(first, 7), last=_rounded(last, 7))
+        periods = [f"{2 * np.pi / one:.6g}" for one in (moved.first, moved.last)]
+        as_what = ", with the square of its frequency, as of an unbalance" if middle.grows else ""
+        words = f"swings in time, on {name}, with a period from {periods[0]} to {periods[1]}{as_what}"
+        return Nameless((i,), (moved.terms(),), words=words, kind="forcing")
+
+    apart = _APART_IN_PHASE * 4 * np.pi / middle.span * np.arange(-_EITHER_WAY, _EITHER_WAY + 1)
+    return Family(law, (middle.first + apart, middle.last + apart), choices=float(np.log(number)))
 
 
 def _rounded(value: float, digits: int) -> float:
