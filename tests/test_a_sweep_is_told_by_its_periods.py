@@ -63,8 +63,9 @@ def test_a_rotor_that_runs_up_through_resonance_is_told():
     told = diagnose(file, [run], Options(restriction=Restriction(FEW), jobs=2))
     (finding,) = told.document["findings"]
     assert finding["effect"] == "unnamed_force" and finding["probability"] > 0.95
-    periods = finding["sentence"].split("with a period from ")[1].split(" to ")
-    first, last = float(periods[0]), float(periods[1].split(":")[0].split(",")[0])
+    first, last = (
+        float(one.split()[0]) for one in finding["sentence"].split("with a period from ")[1].split(" to ")[:2]
+    )
     # The sweep that is told ends with the fitted rows, at 45 s, where the frequency is 3.25 rad/s.
     assert (first, last) == pytest.approx((2 * np.pi, 2 * np.pi / 3.25), rel=0.01)
     assert told.document["fit"]["after"]["holdout_rmse"]["y"] < 0.015

@@ -15,7 +15,7 @@ from .._symbolic import derivative
 from ._motion import rms
 
 # Share of the prior of what has no name that they have, beside that of simple laws.
-_SHARE = 0.25
+_SHARE = 0.125
 # What fades with the way does so within twice the whole swing, or a twentieth of it.
 _WAYS = 0.5, 20.0
 _WORDS = {

@@ -198,9 +198,10 @@ def _in_a_swing(i: int, name: str, q: sympy.Expr, v: sympy.Expr, low: float, hig
 def _sweep(i: int, name: str, middle: Sweep, number: int) -> Family:
     def law(first: float, last: float) -> Nameless:
         moved = replace(middle, first=_rounded(first, 7), last=_rounded(last, 7))
-        periods = [f"{2 * np.pi / one:.6g}" for one in (moved.first, moved.last)]
-        as_what = ", with the square of its frequency, as of an unbalance" if middle.grows else ""
-        words = f"swings in time, on {name}, with a period from {periods[0]} to {periods[1]}{as_what}"
+        begin, end = (f"{2 * np.pi / one:.6g} at t = {t:.4g}"
+                      for one, t in ((moved.first, moved.start), (moved.last, moved.start + moved.span)))  # fmt: skip
+        as_what = " and the square of its frequency, as of an unbalance" if middle.grows else ""
+        words = f"swings in time, on {name}, with a period from {begin} to {end}{as_what}"
         return Nameless((i,), (moved.terms(),), words=words, kind="forcing")
 
     apart = _APART_IN_PHASE * 4 * np.pi / middle.span * np.arange(-_EITHER_WAY, _EITHER_WAY + 1)
