@@ -79,6 +79,8 @@ def test_what_else_is_open_is_told_too():
     wrong = [[("sensor_bias", ("left",))], [("sensor_bias", ("right",))]]
     assert "which of them is wrong" in next_measurement(wrong, "mismatch", 0.0, 0.0)
     assert "belongs to one recording alone" in next_measurement([[one], [one]], "mismatch", 0.0, 0.0)
+    force = ("unnamed_force", ("theta",))
+    assert "which form the force without a name has" in next_measurement([[force], [force]], "mismatch", 0.0, 0.0)
     assert next_measurement([[one]], "consistent", 0.97, 0.0).startswith("none is needed")
     assert next_measurement([], "consistent", 0.5, 0.0).startswith("none is needed")
     assert "free decay of x" in next_measurement([[one]], "consistent", 0.3, 0.0)

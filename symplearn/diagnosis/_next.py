@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
+from .._effects import UNNAMED
 from ._impostors import OVER_TIME, SHOWS, UNMASK
 
 _Key = tuple[str, tuple[str, ...]]  # effect and targets
@@ -14,6 +15,7 @@ _REPEATED = (
     "a repeat of each recording under its own conditions, several times: whether the effect belongs to one recording "
     "alone is open"
 )
+_FORM = "recordings at other amplitudes and speeds: which form the force without a name has is open"
 # Where the simulation as it is, or a remainder without a name, has more than this, it is a rival itself.
 _OPEN, _SETTLED = 0.05, 0.9
 _MOST = 2
@@ -25,8 +27,8 @@ def next_measurement(
     """Which recording would tell the likeliest combinations apart, without a full stop.
 
     **Arguments:** - `rivals`: combinations of (effect, targets), likeliest first; one that stands there twice is the
-    same effects in different recordings. - `as_it_is`, `unexplained`: probabilities of the simulation with nothing left
-    out, and of a remainder without a name.
+    same effects in different recordings, or a force without a name in different forms. - `as_it_is`, `unexplained`:
+    probabilities of the simulation with nothing left out, and of a remainder without a name.
     """
     if verdict == "consistent" and (not rivals or as_it_is > _SETTLED):
         return _HARDER
@@ -52,7 +54,7 @@ def _disputes(sets: Sequence[_Keys]) -> Iterator[str]:
     for other in sets[1:]:
         top = sets[0]
         if top == other:
-            yield _REPEATED
+            yield _FORM if any(name == UNNAMED.name for name, _ in top) else _REPEATED
             continue
         # Where one is the other and more, the surplus is what is open, and it may stand in for what both have.
         mine, yours = (top - other) or top, (other - top) or other

@@ -30,7 +30,7 @@ class Sweep:
         """Written out in t."""
         s = symbol("t") - self.start
         rate = (self.last - self.first) / self.span
-        phase = self.first * s + rate / 2 * s**2
+        phase = self.first * s + float(f"{rate / 2:.7g}") * s**2
         size = ((self.first + rate * s) / max(self.first, self.last)) ** 2 if self.grows else 1
         return size * sympy.cos(phase), size * sympy.sin(phase)
 
