@@ -75,9 +75,10 @@ def law_text(one: Candidate, coefficients: Mapping[str, Any]) -> str:
     return _law(one, {name: _shown(value) for name, value in coefficients.items()})
 
 
-def symbolic_law(one: Candidate) -> str:
-    """The law of one effect with the symbols of its coefficients, `F = -c v`."""
-    return _law(one, symbols(one))
+def symbolic_law(one: Candidate, memory: str = "w") -> str:
+    """The law of one effect with the symbols of its coefficients, `F = -c v`; `memory` is what a force that fades is
+    called."""
+    return _law(one, symbols(one) | {"w": memory})
 
 
 def symbols(one: Candidate) -> dict[str, str]:
@@ -128,7 +129,7 @@ def _law(one: Candidate, values: Mapping[str, str]) -> str:
     first, second = one.targets[0], one.targets[-1]
     pair = one.effect.acts_on == PAIR
     names = _names(one, f"v_{first}" if pair else "v" if first != "v" else "dv/dt", f"v_{second}")
-    names |= {"z": "z" if first != "z" else "z_hidden", "w": "w" if first != "w" else "w_force"} | dict(values)
+    names |= {"z": "z" if first != "z" else "z_hidden"} | dict(values)
     name = one.effect.name
     if isinstance(one.effect, Memory):
         return _filled(f"F = -{{w}}, d{{w}}/dt = {_FADING[one.effect]}", names)

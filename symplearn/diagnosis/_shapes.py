@@ -27,7 +27,8 @@ _PLACES, _WIDTHS = np.linspace(0.05, 0.95, 19), np.geomspace(0.03, 0.25, 5)
 # families so many, those that explain most.
 _FIRST, _APART, _EXPLAINED, _MOST = 3, 3, 0.05, 12
 # How far the frequencies of a sweep are moved each way: by steps that shift the phase at one end by so many cycles.
-_EITHER_WAY, _APART_IN_PHASE = 8, 0.05
+# None is slower than a share of what it was.
+_EITHER_WAY, _APART_IN_PHASE, _SLOWEST = 8, 0.05, 0.1
 # Share of the prior of what has no name that all families have, beside that of simple laws.
 _SHARE = 0.25
 # Forces that are the same but for round-off.
@@ -139,7 +140,9 @@ class Shapes:
         """Of one recording: clocks of several begin anew."""
         (o,) = self.outlooks
         push, plain = missing(self.outlooks)[:, i], along_outlooks(self.file, _plain(self.file, i), self.outlooks)
-        found = [swept(o.rows.times[: len(push)], push, plain, grows) for grows in (False, True)]
+        finite = np.isfinite(push) & np.isfinite(plain).all(1)
+        times = o.rows.times[: len(push)][finite]
+        found = [swept(times, push[finite], plain[finite], grows) for grows in (False, True)]
         return [_sweep(i, name, *one) for one in found if one]
 
 
@@ -205,7 +208,8 @@ def _sweep(i: int, name: str, middle: Sweep, number: int) -> Family:
         return Nameless((i,), (moved.terms(),), words=words, kind="forcing")
 
     apart = _APART_IN_PHASE * 4 * np.pi / middle.span * np.arange(-_EITHER_WAY, _EITHER_WAY + 1)
-    return Family(law, (middle.first + apart, middle.last + apart), choices=float(np.log(number)))
+    axes = tuple(np.maximum(end + apart, _SLOWEST * end) for end in (middle.first, middle.last))
+    return Family(law, axes, choices=float(np.log(number)))
 
 
 def _rounded(value: float, digits: int) -> float:

@@ -50,6 +50,8 @@ def swept(
 ) -> tuple[Sweep, int] | None:
     """The sweep that explains most of a force beside plain terms, and of how many it was chosen; None where the best
     one is a swing of one frequency."""
+    if len(times) < 2 or not push.any():
+        return None
     span, gap = float(np.ptp(times)), float(np.median(np.diff(times)))
     highest = np.pi / (2 * gap)
     number = int(min(_MOST, highest * span / np.pi))

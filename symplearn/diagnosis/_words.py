@@ -141,7 +141,8 @@ def _law_with_numbers(said: Said) -> str:
     if not names:
         return law_text(said.one, {"expression": said.coefficients["expression"]})
     values = [f"{shown} = {said.value(name)}" for name, shown in names.items()]
-    return f"{symbolic_law(said.one)}, where {_listed(values, 'and')}"
+    law = symbolic_law(said.one, said.coefficients.get("expression", "-w").removeprefix("-"))
+    return f"{law}, where {_listed(values, 'and')}"
 
 
 def in_words(rival: str) -> str:
