@@ -40,6 +40,12 @@ def angles(times, start, push=lambda t: 0.0, gravity=lambda t: GRAVITY, blow=(0.
     return cases.struck(rates, start, times, [0.0, size], when)[:, 0]
 
 
+def joined(times, start, omega, strength):
+    """The same with an unseen oscillator of that frequency, at rest at first, by the force w on the pendulum."""
+    rates = lambda t, x: [x[1], -GRAVITY * np.sin(x[0]) + x[2], x[3], strength * x[0] - omega**2 * x[2]]  # noqa: E731
+    return cases.solved(rates, [*start, 0.0, 0.0], times)[:, 0]
+
+
 @pytest.fixture(scope="module")
 def stepper():
     rng = np.random.default_rng(5)
@@ -83,6 +89,8 @@ def columns(effect, place, times, start):
     if effect == "regime_change":
         later = lambda a: lambda t: GRAVITY * (1 + a * (t > place))  # noqa: E731
         return [quotient(lambda a: angles(times, start, gravity=later(a)))]
+    if effect == "hidden_oscillator":
+        return [quotient(lambda a: joined(times, start, place, a))]
     waves = [lambda t: np.cos(place * t), lambda t: np.sin(place * t)]
     if effect == "periodic_forcing":
         return [quotient(lambda a, w=w: angles(times, start, push=lambda t: a * w(t))) for w in waves]
@@ -96,7 +104,7 @@ def gain(stepper, z, effect, place, recordings):
         start = z[starts_at(stepper, r)]
         own = [(angles(run.times, start + h) - angles(run.times, start - h)) / (2 * SMALL) for h in SMALL * np.eye(2)]
         further = columns(effect, place, run.times, start) if r in recordings else None
-        width = 1 if effect in ("impulse", "regime_change") else 2
+        width = 1 if effect in ("impulse", "regime_change", "hidden_oscillator") else 2
         block = np.zeros((len(run.times), 4 + width))
         block[:, 2 * r : 2 * r + 2] = np.transpose(own)
         if further:
@@ -123,16 +131,17 @@ def gain(stepper, z, effect, place, recordings):
         ("regime_change", TIMES[1][[0, 33, 50]]),
         ("periodic_forcing", [0.7, 1.9]),
         ("parametric_modulation", [0.7, 1.9]),
+        ("hidden_oscillator", [0.7, 1.9]),
     ],
 )
 def test_the_gain_is_that_of_trajectories(stepper, priors, fits, effect, places):
-    """About a swinging pendulum's fit, of a blow to the second recording and of all else in both: as least squares on
-    difference quotients of trajectories by SciPy have it."""
+    """About a swinging pendulum's fit, of a blow to the second recording and of all else in both, an unseen oscillator
+    begun at rest: as least squares on difference quotients of trajectories by SciPy have it."""
     p = stepper.problem
     m = one_of(p, effect)
     one = p.candidate(m)
     recordings = tangent._recordings(stepper, fits, [len(t) for t in TIMES], priors)
-    sums = [tangent._sums(p, own, m, np.asarray(places)) for own in recordings]
+    sums = [tangent._sums(p, own, m, np.asarray(places), False) for own in recordings]
     which = (1,) if effect == "impulse" else (0, 1)
     total = sums[1] if effect == "impulse" else sums[0] + sums[1]
     found = total.gains(priors.scales[one.first : one.first + one.effect.amplitudes])
@@ -148,7 +157,7 @@ def test_the_best_time_is_that_of_the_blow(stepper, priors, fits):
     found = tangent.sharp_units(stepper, fits, rows, priors)
     assert found[one_of(p, "impulse")][0].place == pytest.approx(BLOW[1], abs=np.diff(TIMES[1])[0])
     assert {p.candidate(m).effect.name for m in found} == {
-        "impulse", "regime_change", "periodic_forcing", "parametric_modulation"}  # fmt: skip
+        "impulse", "regime_change", "periodic_forcing", "parametric_modulation", "hidden_oscillator"}  # fmt: skip
     for m, units in found.items():
         one = p.candidate(m)
         ends = (priors.lower[one.values.stop - 1], priors.upper[one.values.stop - 1])

@@ -1,9 +1,9 @@
 """When a further effect would help, at every time and frequency at once: from the tangent flow of one trajectory.
 
 A disturbance at time s shows at time t as R(t) Phi(s)^-1 times it, where Phi are the slopes of the phase point in its
-start and R those of the readings. So the response to a blow, a periodic force or a change of a parameter is a sum of
-columns that are known already, and no trajectory is stepped for any place (the score test of Rao 1948, as in `_score`;
-only the best places are looked at there).
+start and R those of the readings. So the response to a blow, a periodic force, an unseen oscillator or a change of a
+parameter is a sum of columns that are known already, and no trajectory is stepped for any place (the score test of Rao
+1948, as in `_score`; only the best places are looked at there).
 """
 
 from collections.abc import Sequence
@@ -17,12 +17,14 @@ from ._calibrate import Fits, Priors, by_the_noise, noise_roots, weights
 from ._problem import Problem
 from ._scan import BEST, grid, layout, packed, spacing
 from ._score import Unit
+from ._stochastic import trajectories
 from ._trajectory import Stepper
 
 # Effects whose places are looked for here: at times, and at frequencies.
-_SUDDEN, _PERIODIC = (effects.IMPULSE, effects.REGIME), (effects.FORCING, effects.MODULATION)
-# Places kept for each effect and target, of all choices of recordings; times that are looked at.
-_KEPT, _TIMES = 8, 400
+_SUDDEN, _PERIODIC = (effects.IMPULSE, effects.REGIME), (effects.FORCING, effects.MODULATION, effects.HIDDEN)
+# Places kept for each effect and target, of all choices of recordings; times and frequencies that are looked at, and
+# how many of these together.
+_KEPT, _TIMES, _FREQUENCIES, _TOGETHER = 8, 400, 400, 80
 # Of the distance of a grid's neighbours, how far apart those are at least.
 _APART = 1.5
 # Round-off of an inverse, relative; beyond, the trajectory is too chaotic to be drawn back to its start.
@@ -41,15 +43,13 @@ class _Recording:
     done: dict[int, Float[np.ndarray, "row state"]]  # up to each row, by a unit of what acts all the time
     error: Float[np.ndarray, "row channel"]  # what the unknowns leave of the readings' errors
     others: Float[np.ndarray, "row channel unknown"]  # an orthonormal basis of what the unknowns can do
+    path: Float[np.ndarray, "row state"]
 
     def drawn(self, vectors: Float[np.ndarray, "*place row state"]) -> "_Sums":
         """Sums over what `vectors` at the start show at each row."""
         shown = np.einsum("tmd,...td->...tm", self.slopes, vectors)
-        return _Sums(
-            np.einsum("katm,kbtm->kab", shown, shown),
-            np.einsum("katm,tm->ka", shown, self.error),
-            np.einsum("katm,tmq->kaq", shown, self.others),
-        )
+        flat = shown.reshape(*shown.shape[:2], -1)
+        return _Sums(flat @ flat.mT, flat @ self.error.ravel(), flat @ self.others.reshape(flat.shape[2], -1))
 
     def after(self, tail: Float[np.ndarray, "row channel"], vectors: np.ndarray, places: np.ndarray) -> "_Sums":
         """The same of `tail` plus what `vectors` (row, state) show, over the rows later than each place."""
@@ -80,11 +80,28 @@ class _Sums:
     push: Float[np.ndarray, "place amplitude"]
     shared: Float[np.ndarray, "place amplitude unknown"]
 
+    @classmethod
+    def joined(cls, listed: Sequence["_Sums"]) -> "_Sums":
+        """Of places one after the other."""
+        each = zip(*((one.square, one.push, one.shared) for one in listed), strict=True)
+        return cls(*(np.concatenate(some) for some in each))
+
     def __add__(self, other: "_Sums") -> "_Sums":
         return _Sums(self.square + other.square, self.push + other.push, self.shared + other.shared)
 
     def gains(self, scales: Float[np.ndarray, " amplitude"]) -> Float[np.ndarray, " place"]:
         """Log evidence that amplitudes of these prior widths gain at each place."""
+        left, gained = self._solved(scales)
+        return gained - 0.5 * np.linalg.slogdet(left)[1]
+
+    def likelihoods(self, scales: Float[np.ndarray, " amplitude"]) -> Float[np.ndarray, " place"]:
+        """What the log likelihood and prior gain at each place: the evidence of amplitudes of unknown order of
+        magnitude goes with it, whether a unit shows much, as in resonance, or little."""
+        return self._solved(scales)[1]
+
+    def _solved(
+        self, scales: Float[np.ndarray, " amplitude"]
+    ) -> tuple[Float[np.ndarray, "place amplitude amplitude"], Float[np.ndarray, " place"]]:
         unit = np.outer(scales, scales)
         square = self.square * unit
         left = square - np.einsum("kaq,kbq->kab", self.shared, self.shared) * unit
@@ -92,7 +109,7 @@ class _Sums:
         left[:, diagonal, diagonal] += 1.0 + _ROUND_OFF * square[:, diagonal, diagonal]
         push = self.push * scales
         solved = np.linalg.solve(left, push[..., None])[..., 0]
-        return 0.5 * (push * solved).sum(1) - 0.5 * np.linalg.slogdet(left)[1]
+        return left, 0.5 * (push * solved).sum(1)
 
 
 def sharp_units(stepper: Stepper, fits: Fits, rows: Sequence[int], priors: Priors) -> dict[int, list[Unit]]:
@@ -110,8 +127,12 @@ def _best(problem: Problem, recordings: Sequence[_Recording], priors: Priors, ca
     """The best places of an effect and target, in all recordings or in some."""
     one = problem.equations.candidates[candidate]
     places = _places(problem, recordings, priors, candidate)
-    sums = [_sums(problem, own, candidate, places) for own in recordings]
+    cut = range(0, len(places), _TOGETHER) if one.effect in _PERIODIC else (0,)
+    parts = [places[a : a + _TOGETHER] if one.effect in _PERIODIC else places for a in cut]
+    alone = len(recordings) == 1
+    sums = [_Sums.joined([_sums(problem, own, candidate, some, alone) for some in parts]) for own in recordings]
     scales = priors.scales[one.first : one.first + one.effect.amplitudes]
+    scales = np.concatenate([scales, priors.unseen]) if one.effect is effects.HIDDEN and alone else scales
     ends = priors.lower[one.values.stop - 1], priors.upper[one.values.stop - 1]
     apart = _APART * spacing(one, *map(float, ends))
     found: dict[int, float] = {}
@@ -122,8 +143,9 @@ def _best(problem: Problem, recordings: Sequence[_Recording], priors: Priors, ca
         mine = sums[which[0]]
         for r in which[1:]:
             mine = mine + sums[r]
-        gains = np.nan_to_num(mine.gains(scales), nan=-np.inf, posinf=-np.inf)
-        for k in _peaks(gains, places, apart)[:BEST]:
+        gains = mine.likelihoods(scales) if one.effect is effects.HIDDEN else mine.gains(scales)
+        gains = np.nan_to_num(gains, nan=-np.inf, posinf=-np.inf)
+        for k in _peaks(gains, places, apart)[: _KEPT if one.effect is effects.HIDDEN else BEST]:
             found[k] = max(found.get(k, -np.inf), float(gains[k]))
     every = np.full(len(places), -np.inf)
     every[list(found)] = list(found.values())
@@ -144,12 +166,17 @@ def _peaks(gains: Float[np.ndarray, " place"], places: Float[np.ndarray, " place
 def _places(problem: Problem, recordings: Sequence[_Recording], priors: Priors, candidate: int) -> np.ndarray:
     one = problem.equations.candidates[candidate]
     if one.effect in _PERIODIC:
+        ends = float(priors.lower[one.values.stop - 1]), float(priors.upper[one.values.stop - 1])
+        number = int(np.ceil((ends[1] - ends[0]) / spacing(one, *ends))) + 1
+        if number <= _FREQUENCIES:
+            return np.linspace(*ends, number)
         return np.array([unit.place for unit in grid(problem, priors, candidate)])
     times = np.unique(np.concatenate([own.times[:-1] for own in recordings]))
     return times[:: max(1, -(-len(times) // _TIMES))]
 
 
-def _sums(problem: Problem, own: _Recording, candidate: int, places: np.ndarray) -> _Sums:
+def _sums(problem: Problem, own: _Recording, candidate: int, places: np.ndarray, alone: bool = True) -> _Sums:
+    """Of some places; an unseen oscillator's start is looked for where a recording is `alone`, and is at rest else."""
     one = problem.equations.candidates[candidate]
     if one.effect is effects.IMPULSE:
         blows = own.back[:, :, problem.equations.width + one.place]
@@ -158,14 +185,33 @@ def _sums(problem: Problem, own: _Recording, candidate: int, places: np.ndarray)
     if one.effect is effects.REGIME:
         return own.after(np.einsum("tmd,td->tm", own.slopes, done), -done, places)
     angle = places[:, None] * (0.5 * (own.times[1:] + own.times[:-1]) - problem.equations.origin)
-    waves = np.stack([np.cos(angle), np.sin(angle)], axis=1)[..., None] * np.diff(done, axis=0)
-    return own.drawn(np.pad(np.cumsum(waves, axis=2), [(0, 0), (0, 0), (1, 0), (0, 0)]))
+    waves = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    if one.effect is effects.HIDDEN:
+        waves = _given_back(own, one.place, places, waves, alone)
+    pushed = waves[..., None] * np.diff(done, axis=0)
+    return own.drawn(np.pad(np.cumsum(pushed, axis=2), [(0, 0), (0, 0), (1, 0), (0, 0)]))
+
+
+def _given_back(
+    own: _Recording, coordinate: int, places: np.ndarray, waves: Float[np.ndarray, "place 2 span"], alone: bool
+) -> Float[np.ndarray, "place amplitude span"]:
+    """The force of an unseen oscillator, begun at rest, by a unit of its strength; and that of a unit of its place and
+    of its speed at the start. In the middle of each span: w'' = -omega^2 w + q."""
+    q = own.path[:, coordinate]
+    taken = waves * (0.5 * (q[1:] + q[:-1]) * np.diff(own.times))
+    before = np.cumsum(taken, axis=2) - 0.5 * taken
+    omega = places[:, None]
+    given = (waves[:, 1] * before[:, 0] - waves[:, 0] * before[:, 1]) / omega
+    if not alone:
+        return given[:, None]
+    angle = omega * (0.5 * (own.times[1:] + own.times[:-1]) - own.times[0])
+    return np.stack([given, np.cos(angle), np.sin(angle) / omega], axis=1)
 
 
 def _steady(problem: Problem, candidate: int) -> int:
     """What acts all the time as a periodic force or a change of a parameter does at one."""
     one = problem.equations.candidates[candidate]
-    kind = effects.POWERS[0] if one.effect is effects.FORCING else effects.ERROR
+    kind = effects.POWERS[0] if one.effect in (effects.FORCING, effects.HIDDEN) else effects.ERROR
     return next(k for k, c in enumerate(problem.equations.candidates) if c.effect is kind and c.places == one.places)
 
 
@@ -180,7 +226,9 @@ def _recordings(stepper: Stepper, fits: Fits, rows: Sequence[int], priors: Prior
     }
     lanes = list(packed(problem, [Unit(c, None) for c in sorted(steady)]))
     laid = [layout(problem, units) for units in ([], *lanes)]
-    out = []
+    paths, out = trajectories(stepper, fits.z[0], fits.combinations[0], rows), list[_Recording]()
+    if not all(np.isfinite(path).all() for path in paths):
+        return None
     for r, (error, others) in enumerate(left):
         start, *further = stepper.carried(fits.z[0], fits.combinations[0], laid, rows[r], r)
         back = _inverses(start[:, :, problem.channels :].transpose(1, 2, 0))
@@ -190,7 +238,7 @@ def _recordings(stepper: Stepper, fits: Fits, rows: Sequence[int], priors: Prior
         done = {unit.candidate: np.einsum("tds,ts->td", back, x[:, problem.channels :]) for unit, x in pairs}
         root = noise_roots(weights(problem, rows), fits)[r]
         slopes = start[:, :, : problem.channels].transpose(1, 2, 0) * root[..., None]
-        out.append(_Recording(problem.rows[r].times[: rows[r]], slopes, back, done, error, others))
+        out.append(_Recording(problem.rows[r].times[: rows[r]], slopes, back, done, error, others, paths[r]))
     return out
 
 
