@@ -11,8 +11,9 @@ from .._expression import symbol
 
 # The most frequencies at the beginning and at the end that are looked at; they are half a cycle of the recording apart.
 _MOST = 120
-# A sweep's phase is somewhere this many cycles off that of its middle frequency; else it is a swing of that one.
-_BENT = 0.5
+# A sweep's phase is somewhere this many cycles off that of its middle frequency; else it is a swing of that one. And it
+# has so many cycles at least: with fewer it is any smooth course in time.
+_BENT, _CYCLES = 0.5, 4.0
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def swept(
     grows: bool,
 ) -> tuple[Sweep, int] | None:
     """The sweep that explains most of a force beside plain terms, and of how many it was chosen; None where the best
-    one is a swing of one frequency."""
+    one is a swing of one frequency, or too short."""
     if len(times) < 2 or not push.any():
         return None
     span, gap = float(np.ptp(times)), float(np.median(np.diff(times)))
@@ -70,7 +71,8 @@ def swept(
     simplex = np.array([frequencies[[a, b]] + off for off in ([0.0, 0.0], [step / 2, 0.0], [0.0, step / 2])])
     found = minimize(left, simplex[0], method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": step / 100})
     first, last = map(float, found.x)
-    if min(first, last) <= 0 or abs(last - first) * span / 8 < 2 * np.pi * _BENT:
+    bent, cycles = abs(last - first) * span / (16 * np.pi), (first + last) * span / (4 * np.pi)
+    if min(first, last) <= 0 or bent < _BENT or cycles < _CYCLES:
         return None
     return Sweep(first, last, float(times[0]), span, grows), number**2
 
