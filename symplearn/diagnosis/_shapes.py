@@ -142,8 +142,7 @@ class Shapes:
         push, plain = missing(self.outlooks)[:, i], along_outlooks(self.file, _plain(self.file, i), self.outlooks)
         finite = np.isfinite(push) & np.isfinite(plain).all(1)
         times = o.rows.times[: len(push)][finite]
-        found = [swept(times, push[finite], plain[finite], grows) for grows in (False, True)]
-        return [_sweep(i, name, *one) for one in found if one]
+        return [_sweep(i, name, *one) for one in swept(times, push[finite], plain[finite])]
 
 
 def _plain(file: SimulationFile, i: int) -> tuple[sympy.Expr, sympy.Expr, sympy.Expr]:

@@ -9,8 +9,9 @@ from scipy.optimize import minimize
 
 from .._expression import symbol
 
-# The most frequencies at the beginning and at the end that are looked at; they are half a cycle of the recording apart.
-_MOST = 120
+# The most frequencies at the beginning and at the end that are looked at; they are half a cycle of the recording apart
+# where they are fewer, as up to 500 rows.
+_MOST = 250
 # A sweep's phase is somewhere this many cycles off that of its middle frequency; else it is a swing of that one. And it
 # has so many cycles at least: with fewer it is any smooth course in time.
 _BENT, _CYCLES = 0.5, 4.0
@@ -44,37 +45,44 @@ class Sweep:
 
 
 def swept(
-    times: Float[np.ndarray, " row"],
-    push: Float[np.ndarray, " row"],
-    plain: Float[np.ndarray, "row term"],
-    grows: bool,
-) -> tuple[Sweep, int] | None:
-    """The sweep that explains most of a force beside plain terms, and of how many it was chosen; None where the best
-    one is a swing of one frequency, or too short."""
+    times: Float[np.ndarray, " row"], push: Float[np.ndarray, " row"], plain: Float[np.ndarray, "row term"]
+) -> list[tuple[Sweep, int]]:
+    """The sweeps of one size, and that grows, which explain most of a force beside plain terms, and of how many they
+    were chosen; none that is a swing of one frequency, or too short."""
     if len(times) < 2 or not push.any():
-        return None
+        return []
     span, gap = float(np.ptp(times)), float(np.median(np.diff(times)))
     highest = np.pi / (2 * gap)
     number = int(min(_MOST, highest * span / np.pi))
     if number < 2:
-        return None
+        return []
     frequencies = np.linspace(2 * np.pi / span, highest, number)
-    a, b = _strongest(times - times[0], push - plain @ np.linalg.lstsq(plain, push, rcond=None)[0], frequencies)
+    rest = push - plain @ np.linalg.lstsq(plain, push, rcond=None)[0]
+    ends, step = frequencies[[*_strongest(times - times[0], rest, frequencies)]], np.pi / span
+    found = [_nearest(times, push, plain, ends, step, grows) for grows in (False, True)]
+    return [(one, number**2) for one in found if _is_sweep(one)]
+
+
+def _is_sweep(one: Sweep) -> bool:
+    bent, cycles = abs(one.last - one.first) * one.span / (16 * np.pi), (one.first + one.last) * one.span / (4 * np.pi)
+    return min(one.first, one.last) > 0 and bent >= _BENT and cycles >= _CYCLES
+
+
+def _nearest(
+    times: Float[np.ndarray, " row"], push: Float[np.ndarray, " row"], plain: Float[np.ndarray, "row term"],
+    begin: Float[np.ndarray, "2"], step: float, grows: bool,
+) -> Sweep:  # fmt: skip
+    """The best one near two frequencies, to hundredths of a step."""
+    start, span = float(times[0]), float(np.ptp(times))
 
     def left(ends: Float[np.ndarray, "2"]) -> float:
-        columns = np.concatenate(
-            [plain, Sweep(float(ends[0]), float(ends[1]), float(times[0]), span, grows).along(times)], axis=1
-        )
+        one = Sweep(float(ends[0]), float(ends[1]), start, span, grows)
+        columns = np.concatenate([plain, one.along(times)], axis=1)
         return float(((push - columns @ np.linalg.lstsq(columns, push, rcond=None)[0]) ** 2).sum() / (push @ push))
 
-    step = np.pi / span
-    simplex = np.array([frequencies[[a, b]] + off for off in ([0.0, 0.0], [step / 2, 0.0], [0.0, step / 2])])
-    found = minimize(left, simplex[0], method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": step / 100})
-    first, last = map(float, found.x)
-    bent, cycles = abs(last - first) * span / (16 * np.pi), (first + last) * span / (4 * np.pi)
-    if min(first, last) <= 0 or bent < _BENT or cycles < _CYCLES:
-        return None
-    return Sweep(first, last, float(times[0]), span, grows), number**2
+    simplex = begin + step / 2 * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    found = minimize(left, begin, method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": step / 100})
+    return Sweep(float(found.x[0]), float(found.x[1]), start, span, grows)
 
 
 def _strongest(
