@@ -1,18 +1,15 @@
 """Everything that is said about a finished search."""
 
-from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from .._effects import COORDINATE, IMPULSE, MEMORIES, OUTLIERS, PAIR, Candidate
-from .._expression import Expression
 from . import _document as document
 from ._along import along, energy, force
 from ._augment import augmented
 from ._build import rows_fitted
-from ._coefficients import coefficients
 from ._effect_priors import STRENGTH
 from ._forecast import forecast
 from ._found import Found
@@ -27,15 +24,14 @@ from ._locate import (
     where_sentence,
     whole_windows,
 )
-from ._memories import written_memory
 from ._options import Options
 from ._outlook import Outlook, intensity_of
 from ._posterior import CONSISTENT, Posterior, Weighed, posterior
 from ._problem import Combination, Problem
 from ._record import Diagnosis, Forecast, Series
+from ._told import Told
 from ._trajectory import Stepper
 from ._units import coefficient_units, time_unit
-from ._unnamed import written
 from ._warnings import doubled, set_back, warnings
 from ._weighed import Estimate, coloured_inflation
 from ._words import equation_lines, finding_sentence, next_measurement
@@ -113,10 +109,7 @@ class Answer:
         return [Outlook(self.stepper, estimate, r, self.pull.intensity) for r in range(len(self.problem.rows))]
 
     def diagnosis(self, seconds: float) -> Diagnosis:
-        f, eq, values = self.file, self.problem.equations, self.values
-        chosen: list[tuple[Candidate, Mapping[str, Any]]] = [(self.problem.candidate(m), v) for m, v in values.items()]
-        chosen += [(one, _texts(e, self.memories.get(m, {})))
-                   for m, some in self.expressions.items() for one, e in some.items()]  # fmt: skip
+        f, eq, told = self.file, self.problem.equations, self.told
         forces = {p: e.text for p, e in f.forces.items()}
         readings = {c: e.text for c, e in f.recording.observe.items()}
         lines = (f.coordinates, f.momenta, eq.columns, f.hamiltonian.text, forces, readings)
@@ -127,48 +120,18 @@ class Answer:
             coordinates=f.coordinates,
             units=f.units,
             equation_before=equation_lines(*lines, []),
-            equation_after=equation_lines(*lines, chosen),
+            equation_after=equation_lines(*lines, told.chosen()),
             series=tuple(self._series(r) for r in range(len(self.recordings))),
             augmented=augmented(
-                f, self.problem, self.found.priors, self.after, values, self.expressions, self.memories
+                f, self.problem, self.found.priors, self.after, told.values, told.expressions, told.memories
             ),
             forecast=self.forecast,
         )
 
     @cached_property
-    def told(self) -> dict[int, dict[str, Any]]:
-        """The coefficients of every finding that has a name, or fades, by member."""
-        named = [m for m in self.after.combination if _has_numbers(self.problem.candidate(m))]
-        return {m: coefficients(self.problem, self.found.priors, self.after, m, self._spread()) for m in named}
-
-    @cached_property
-    def values(self) -> dict[int, dict[str, float]]:
-        """Point values of the coefficients of what has a name."""
-        named = {m: told for m, told in self.told.items() if self.problem.candidate(m).nameless is None}
-        return {m: {name: one["mean"] for name, one in told.items()} for m, told in named.items()}
-
-    @cached_property
-    def expressions(self) -> dict[int, dict[Candidate, Expression]]:
-        """Forces without a name among the findings, by member and what is told of it on each coordinate."""
-        places = self.problem.placed(self.after.combination)
-        ones = [(m, self.problem.candidate(m).told(), self.after.z[place]) for m, place in places]
-        found = {m: {one: written(one.nameless.pushes[0], sizes) for one in told if one.nameless}
-                 for m, told, sizes in ones if told[0].nameless and not told[0].nameless.memory}  # fmt: skip
-        return found | {m: {self.problem.candidate(m): force} for m, (force, _) in self._fading.items()}
-
-    @cached_property
-    def memories(self) -> dict[int, Mapping[str, Expression]]:
-        """What those that fade remember, by member: the rate of change of every name that is not the simulation's."""
-        return {m: rates for m, (_, rates) in self._fading.items()}
-
-    @cached_property
-    def _fading(self) -> dict[int, tuple[Expression, Mapping[str, Expression]]]:
-        out = {}
-        for m in self.after.combination:
-            if (force := self.problem.candidate(m).nameless) and force.memory:
-                sizes = [self.told[m][name]["mean"] for name in force.memory.coefficients]
-                out[m] = written_memory(self.file, force.memory, self.file.coordinates[force.places[0]], sizes)
-        return out
+    def told(self) -> Told:
+        """The numbers and expressions of the findings."""
+        return Told(self.file, self.problem, self.found.priors, self.after, self._spread())
 
     def _spread(self) -> float:
         return 1.0 / self.posterior.tempered
@@ -248,7 +211,7 @@ class Answer:
 
     def _finding(self, member: int, one: Candidate) -> dict[str, Any]:
         p, rest = self.posterior, tuple(c for c in self.after.combination if c != member)
-        told = self.told.get(member, {}) | (self._expression(member, one) if one.nameless else {})
+        told = self.told.of(member, one)
         which = [r + 1 for r in self.problem.members[member].recordings]
         only = None if len(which) == len(self.recordings) else which
         f = self.file
@@ -266,14 +229,6 @@ class Answer:
         }
         further = {"side": one.side, "relative_sd": told.get("relative_sd")}
         return found | {name: value for name, value in further.items() if value is not None}
-
-    def _expression(self, member: int, one: Candidate) -> dict[str, Any]:
-        """A force without a name on one coordinate, and how well its size is known where it has one."""
-        text, place = self.expressions[member][one].text, dict(self.problem.placed(self.after.combination))[member]
-        if one.effect.amplitudes > 1 or member in self.memories:
-            return _texts(self.expressions[member][one], self.memories.get(member, {}))
-        sd = np.sqrt(self.after.covariance[place, place].item() * self._spread())
-        return {"expression": text, "relative_sd": float(sd / max(abs(self.after.z[place].item()), 1e-300))}
 
     def _against(self, rest: Combination) -> float | None:
         """Log Bayes factor against a smaller combination; against nothing at all where that one cannot be fitted."""
@@ -317,7 +272,7 @@ class Answer:
         combination = self.chosen.combination
         kind, targets = kind_and_targets(self.problem, combination)
         which = sorted({r + 1 for m in combination for r in self.problem.members[m].recordings})
-        windows = present_windows(self.problem, self.lens, combination, self.values)
+        windows = present_windows(self.problem, self.lens, combination, self.told.values)
         return {"kind": kind, "targets": targets, "recordings": which, "time_windows": windows, "where": self._where()}
 
     def _where(self) -> str:
@@ -326,7 +281,7 @@ class Answer:
         if not moving and all(not one.effect.is_dynamics for one in chosen):
             return f"in the sensor of {', '.join(dict.fromkeys(one.targets[0] for one in chosen))}"
         if all(one.effect is IMPULSE for one in chosen):
-            times = [self.values[member]["t_star"] for member in self.after.combination]
+            times = [self.told.values[member]["t_star"] for member in self.after.combination]
             return blows_sentence(chosen, times)
         told = [(one.targets, one.nameless.words) for one in chosen if one.nameless and one.nameless.words]
         if told:
@@ -391,14 +346,3 @@ class Answer:
             return None
         return forecast(self.stepper, self.recordings[0], self.before, self.run, self.times, self._spread(),
                         self.options.seed)  # fmt: skip
-
-
-def _has_numbers(one: Candidate) -> bool:
-    """Whether a finding is told by its coefficients, and not by an expression alone."""
-    return one.nameless is None or one.nameless.memory is not None
-
-
-def _texts(force: Expression, memory: Mapping[str, Expression]) -> dict[str, str]:
-    """A force without a name, and what it remembers, if anything."""
-    rates = [f"d{name}/dt = {rate.text}" for name, rate in memory.items()]
-    return {"expression": force.text} | ({"memory": ", ".join(rates)} if rates else {})
