@@ -28,7 +28,7 @@ def test_a_weight_that_rises_has_no_negative_gravity():
     mean, sd = above_zero(-0.2, 0.3)
     # 1e-7: the bound of what is positive is not zero but 1e-9. Seen: 4e-9.
     assert parameters(p, priors, below, 1.0)["g"] == pytest.approx({"mean": mean, "sd": sd}, rel=1e-7)
-    again = parse_simulation(simulation_text(augmented(file, p, priors, below, {}, {})), "augmented.toml")
+    again = parse_simulation(simulation_text(augmented(file, p, priors, below, {}, {}, {})), "augmented.toml")
     assert 0.0 < again.parameters["g"].value < 1e-6
 
 
@@ -76,7 +76,7 @@ c = { value = 0.01, sd = 0.05 }
     priors, z = priors_without_effects(p), np.zeros(p.size)
     z[p.head : p.head + 2] = 2.1, -0.004
     beyond = Estimate((), "white", z, np.diag(np.where(p.active(()), 1e-4, 0.0)), np.ones(1), 0.0, True)
-    again = parse_simulation(simulation_text(augmented(file, p, priors, beyond, {}, {})), "augmented.toml")
+    again = parse_simulation(simulation_text(augmented(file, p, priors, beyond, {}, {}, {})), "augmented.toml")
     assert again.parameters["k"].value == 1.9
     assert 0.0 < again.terms[0].coefficients["c"].value < 1e-6
     assert 1.5 < parameters(p, priors, beyond, 1.0)["k"]["mean"] < 1.9
