@@ -132,7 +132,8 @@ def test_where_there_is_no_law_and_no_expression_an_answer_is_given(monkeypatch,
         state = [q, p + 0.15 * rng.normal()]
     readings = np.array([*shown, state[0]]) + 0.02 * rng.normal(size=len(times))
     asked = []
-    monkeypatch.setattr(_nameless, missing, lambda *given: [])
+    for name in {missing, "memories"}:
+        monkeypatch.setattr(_nameless, name, lambda *given: [])
     monkeypatch.setattr(_nameless, "proposals", lambda *given: asked.append(given) or [])
     some = Restriction(("viscous_damping", "unnamed_force"))
     found = diagnose(cases.simulation("p**2/2 - cos(q)"), [cases.recorded(times, readings)], Options(restriction=some))
