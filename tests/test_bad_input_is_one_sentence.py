@@ -50,12 +50,6 @@ def changed(old, new):
     return GOOD.replace(old, new)
 
 
-def remembering(memory):
-    """A force without a name that remembers something."""
-    term = '[[terms]]\neffect = "unnamed_force"\ntarget = "theta"\nexpression = "-w"\nmemory = '
-    return f"{GOOD}\n{term}{memory}\n"
-
-
 TOML = {
     "not TOML": "this is not TOML",
     "open string": 'title = "abc',
@@ -120,12 +114,6 @@ TOML = {
     "limits without room": changed("sd = 0.01", "lower = 0.4, upper = 0.2"),
     "a forcing that never comes round": GOOD
     + '[[terms]]\neffect = "periodic_forcing"\ntarget = "theta"\na = 1.0\nomega = 0\nphi = 0.0\n',
-    "a memory that is no table": remembering("'2*w'"),
-    "a memory of a number": remembering("{ w = 2 }"),
-    "a memory of what is declared": remembering("{ theta = '1', w = '1' }"),
-    "a memory of a function": remembering("{ sin = '1', w = '1' }"),
-    "a memory of nothing known": remembering("{ w = 'nobody' }"),
-    "a memory that is not used by name": remembering("{ v = '1' }"),
     "positive but negative": changed("value = 0.30", "value = -0.3, positive = true"),
     "positive a number": changed("sd = 0.01", "positive = 1"),
     "initial of unknown": changed("theta = { value = 1.0, sd = 0.1 }", "thta = 1"),

@@ -8,6 +8,7 @@ from engine_cases import solved
 
 from symplearn._augmented import equations
 from symplearn._effects import MEMORIES, RELAXING, SLIPPING, Nameless
+from symplearn._errors import InputError
 from symplearn._expression import symbol
 from symplearn._terms import Mechanics
 from symplearn.diagnosis import Options, diagnose
@@ -90,17 +91,26 @@ def test_as_it_is_written_it_is_the_same(memory):
     assert len(shares) == 6 and sum(shares) < 0.2  # the rest is for laws, and for none
 
 
+@pytest.mark.parametrize(
+    "memory",
+    ["'2*w'", "{ w = 2 }", "{ q = '1', w = '1' }", "{ sin = '1', w = '1' }", "{ w = 'nobody' }", "{ v = '1' }"],
+    ids=["no table", "a number", "declared already", "a function", "of nothing known", "another name"],
+)
+def test_a_memory_that_is_none_is_refused_in_one_sentence(memory):
+    """What is no table of rates, a name that is taken, and one that nothing declares: file and place are told."""
+    term = f'[[terms]]\neffect = "unnamed_force"\ntarget = "q"\nexpression = "-w"\nmemory = {memory}'
+    with pytest.raises(InputError) as told:
+        cases.simulation("p**2/2 + q**2/2", more=term)
+    assert "case.toml, [[terms]] 1" in str(told.value) and "\n" not in str(told.value)
+
+
 @pytest.mark.slow
 def test_a_maxwell_element_is_told_by_its_spring_and_its_damper():
     """A spring of 4 and a damper of 2 in series beside a spring of 20, with a force of 0.1 in them at first: one force
     without a name, its kappa and tau inside their intervals, its law in words; with it nothing is left out."""
     run = swung(spring(4.0, tau=0.5))
     first = told(run)
-    (finding,) = first.document["findings"]
-    assert finding["effect"] == "unnamed_force" and finding["probability"] > 0.95
-    for name, truth in (("kappa", 4.0), ("tau", 0.5)):
-        low, high = finding["coefficients"][name]["interval95"]
-        assert low < truth < high and high - low < 0.2 * truth
+    finding = the_force(first, kappa=4.0, tau=0.5)
     assert "a spring and a damper in series" in finding["sentence"] and "dw/dt" in finding["coefficients"]["memory"]
     (term,) = first.augmented.terms
     assert term.expression.text == "-w" and list(term.memory) == ["w"]
@@ -110,7 +120,18 @@ def test_a_maxwell_element_is_told_by_its_spring_and_its_damper():
     assert told_again(first, run) == "consistent"
 
 
+def the_force(told, **truths):
+    """The one finding: a force without a name, every coefficient in its interval, which is narrow."""
+    (finding,) = told.document["findings"]
+    assert finding["effect"] == "unnamed_force" and finding["probability"] > 0.95
+    for name, truth in truths.items():
+        low, high = finding["coefficients"][name]["interval95"]
+        assert low < truth < high and high - low < 0.2 * truth
+    return finding
+
+
 def told_again(first, run):
+    """The verdict on the simulation that has what was found."""
     return diagnose(first.augmented, [run], Options(restriction=Restriction(FEW), jobs=2)).document["verdict"]
 
 
@@ -121,11 +142,7 @@ def test_a_friction_that_gives_before_it_slips_is_told_by_where_it_slips():
     """
     run = swung(spring(4.0, way=0.06))
     first = told(run)
-    (finding,) = first.document["findings"]
-    assert finding["effect"] == "unnamed_force" and finding["probability"] > 0.95
-    for name, truth in (("kappa", 4.0), ("a", 0.06)):
-        low, high = finding["coefficients"][name]["interval95"]
-        assert low < truth < high and high - low < 0.2 * truth
+    finding = the_force(first, kappa=4.0, a=0.06)
     assert "hysteresis" in finding["sentence"]
     assert told_again(first, run) == "consistent"
 
