@@ -109,19 +109,21 @@ class _Known:
 
 @np.errstate(all="ignore")  # a lane that diverged is told by its evidence
 def weigh_clock(
-    problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int], colours: Sequence[Sequence[Colour]]
-) -> list[Estimate]:
+    problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int], colours: Sequence[Sequence[Colour]],
+    like: Estimate | None = None,
+) -> list[Estimate]:  # fmt: skip
     """Estimates where every channel's error has a memory and its clock runs ahead and behind, about the trajectory fit;
     alone, and beside a plain curve of place and speed, each as likely as the other.
 
-    `colours` are those of the sensors alone, by lane and channel. None for a combination with a wrongly given noise.
+    `colours` are those of the sensors alone, by lane and channel; `like` is an estimate of this kind whose errors the
+    search may begin at, too. None for a combination with a wrongly given noise.
     """
     out: list[Estimate] = []
     for lane in _Lane.every(problem, fits, priors, rows):
         begins: list[Both] = [[(colour, replace(colour, ratio=0.0)) for colour in colours[lane.b]]]
-        if out:  # the errors beside another law, too: each search may be caught in an optimum of its own
-            best = max(out, key=lambda one: one.log_evidence)
-            begins.append(list(zip(best.colours, best.clocks, strict=True)))
+        if out or like is not None:  # each search may be caught in an optimum of its own
+            best = max([*out, *([] if like is None else [like])], key=lambda one: one.log_evidence)
+            begins.append(_both(best))
         straight = _straight(lane, begins)
         out.append(_mixed([_told(lane, straight)], _curved(lane.bent(), straight)))
     return out
@@ -132,32 +134,59 @@ def weigh_known_clock(problem: Problem, fits: Fits, priors: Priors, rows: Sequen
     """The only lane beside the errors of sensor and clock that another estimate has, and beside a curve where that has
     one: of its sizes the likeliest, which is granted all of their weight."""
     (lane,) = _Lane.every(problem, fits, priors, rows)
-    lane = lane.bent() if like.bends else lane
-    white = _White.beside(lane, list(zip(like.colours, like.clocks, strict=True)))
-    tried = [_integrated(lane, white, size) for size in (_sizes(lane, like.noise) if like.bends else [like.noise])]
-    return _told(lane, max(tried, key=lambda one: np.nan_to_num(one.estimate.log_evidence, nan=-np.inf)))
+    tried = _of_each_size(lane.bent(), _both(like), like.noise) if like.bends else [_alone(lane, _both(like))]
+    return _told(lane.bent() if like.bends else lane, max(tried, key=_evidence))
+
+
+@np.errstate(all="ignore")
+def weigh_shared_clock(
+    problem: Problem, fits: Fits, priors: Priors, rows: Sequence[int], like: Estimate
+) -> list[Estimate]:
+    """All lanes as `weigh_clock` weighs them, but beside the errors of sensor and clock that another estimate has."""
+    out = []
+    for lane in _Lane.every(problem, fits, priors, rows):
+        straight, bent = _alone(lane, _both(like)), lane.bent()
+        curved = _of_each_size(bent, _both(like), straight.estimate.noise)
+        out.append(_mixed([_told(lane, straight)], [_told(bent, one) for one in curved]))
+    return out
+
+
+def _both(one: Estimate) -> Both:
+    return list(zip(one.colours, one.clocks, strict=True))
+
+
+def _evidence(one: _Known) -> float:
+    return float(np.nan_to_num(one.estimate.log_evidence, nan=-np.inf))
+
+
+def _alone(lane: _Lane, both: Both) -> _Known:
+    """Beside given errors of sensor and clock, and no curve."""
+    return _integrated(lane, _White.beside(lane, both), np.ones(lane.problem.channels))
+
+
+def _of_each_size(lane: _Lane, both: Both, noise: Float[np.ndarray, " channel"]) -> list[_Known]:
+    """Beside the same and a curve of each size."""
+    white = _White.beside(lane, both)
+    return [_integrated(lane, white, size) for size in _sizes(lane, noise)]
 
 
 def _straight(lane: _Lane, begins: list[Both]) -> _Known:
     """Beside errors of sensor and clock alone."""
     z, nothing = lane.fits.z[lane.b], np.zeros((lane.problem.channels, 0))
     for _ in range(_PASSES):  # what is off the path changes what the path is
-        white = _White.beside(lane, _refitted(lane, z, nothing, begins))
-        known = _integrated(lane, white, np.ones(len(nothing)))
-        z, begins = known.estimate.z, [white.both]
+        known = _alone(lane, _refitted(lane, z, nothing, begins))
+        z, begins = known.estimate.z, [known.white.both]
     return known
 
 
 def _curved(lane: _Lane, straight: _Known) -> list[Estimate]:
     """Beside a curve of each size, too, none larger than a remainder may be; of the likeliest size the errors of sensor
     and clock are fitted again."""
-    sizes = _sizes(lane, straight.estimate.noise)
-    white = _White.beside(lane, straight.white.both)
-    tried = [_integrated(lane, white, size) for size in sizes]
-    best = int(np.argmax(np.nan_to_num([one.estimate.log_evidence for one in tried], nan=-np.inf)))
+    tried = _of_each_size(lane, straight.white.both, straight.estimate.noise)
+    best = int(np.argmax(list(map(_evidence, tried))))
     one = tried[best]
-    both = _refitted(lane, one.estimate.z, one.amplitudes, [white.both])
-    again = _integrated(lane, _White.beside(lane, both), sizes[best])
+    both = _refitted(lane, one.estimate.z, one.amplitudes, [straight.white.both])
+    again = _integrated(lane, _White.beside(lane, both), _sizes(lane, straight.estimate.noise)[best])
     if again.estimate.log_evidence > one.estimate.log_evidence:
         tried[best] = again
     return [_told(lane, one) for one in tried]

@@ -9,7 +9,8 @@ from jaxtyping import Float
 from .._effects import OUTLIERS, STOP
 from ._along import along, readings
 from ._calibrate import Fits, Priors, grow, residuals, weights
-from ._clock import weigh_clock, weigh_known_clock
+from ._clock import weigh_known_clock
+from ._clocks import weigh_clocks
 from ._found import Found
 from ._jitter import weigh_jitter
 from ._noisy import PathFit, fit_paths
@@ -162,20 +163,16 @@ class Weigher:
         sensors = weigh_positional(self.problem, fits, priors, self.rows)
         sensors += weigh_positional(self.problem, fits, priors, self.rows, moving=True)
         for estimate in correlated + sensors + weigh_jitter(self.problem, fits, priors, self.rows):
-            self._add_beside_white(estimate)
+            self.add_beside_white(estimate)
 
     def weigh_clocks(self, combinations: Sequence[Combination]) -> None:
         """Weigh combinations, fitted before, where the clock may run ahead and behind beside a coloured error."""
-        own = [c for c in combinations if self.found.of(c, "coloured")]
-        colours = [one.colours for c in own if (one := self.found.of(c, "coloured"))]
-        if own:
-            for one in weigh_clock(self.problem, self._as_fitted(own), self.found.priors, self.rows, colours):
-                self._add_beside_white(one)
+        weigh_clocks(self, combinations)
 
     def weigh_static(self, combinations: Sequence[Combination]) -> None:
         """Weigh combinations, fitted before, beside a small force that goes with place."""
-        for one in weigh_static(self.stepper, self._as_fitted(combinations), self.found.priors, self.rows):
-            self._add_beside_white(one)
+        for one in weigh_static(self.stepper, self.as_fitted(combinations), self.found.priors, self.rows):
+            self.add_beside_white(one)
 
     def beside(self, estimate: Estimate, z: Float[np.ndarray, " z"]) -> Estimate:
         """One beside the remainder of another, which is one of the readings alone and keeps its form, about `z`; its
@@ -196,7 +193,7 @@ class Weigher:
         owed = self._owed_beside(estimate.combination)
         return replace(one, log_evidence=one.log_evidence + owed, outliers=estimate.outliers, converged=True)
 
-    def _as_fitted(self, combinations: Sequence[Combination]) -> Fits:
+    def as_fitted(self, combinations: Sequence[Combination]) -> Fits:
         """Combinations as they were fitted under white noise."""
         whites = [white for c in combinations if (white := self.found.of(c, "white"))]
         z, own = np.stack([one.z for one in whites]), [one.combination for one in whites]
@@ -214,7 +211,7 @@ class Weigher:
         owed = value if estimate.converged else self._owed_beside(estimate.combination)
         self.found.add(replace(estimate, log_evidence=estimate.log_evidence + owed, outliers=told))
 
-    def _add_beside_white(self, estimate: Estimate) -> None:
+    def add_beside_white(self, estimate: Estimate) -> None:
         """Add an estimate under another remainder than white noise."""
         white = self.found.of(estimate.combination, "white")
         owed, told = self._owed_beside(estimate.combination), white.outliers if white else ()
