@@ -13,6 +13,7 @@ import jax
 from matplotlib.figure import Figure
 
 from symplearn._errors import InputError, printable
+from symplearn._places import check_address
 
 
 class Run(NamedTuple):
@@ -92,6 +93,8 @@ def command(
         parser.error(f"--seed is {run.seed}, but must be 0 or more")
     in_double_precision()
     try:
+        if run.scheduler is not None:
+            check_address(run.scheduler)
         run.out.mkdir(parents=True, exist_ok=True)
         experiment(run)
     except (InputError, OSError) as error:

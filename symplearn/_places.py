@@ -21,6 +21,13 @@ _GLANCE = 5.0  # s after which to see whether any worker is there
 _LONGEST = 500  # characters of another program's error
 
 
+def check_address(address: str) -> None:
+    """Raise `InputError` where a scheduler's address is none."""
+    found = _ADDRESS.fullmatch(address)
+    if not found or int(found["port"]) > 65535:
+        raise InputError(f"--scheduler: {shown(address)} is no address; give one as tcp://HOST:8786")
+
+
 class Outcome(NamedTuple):
     """How case `number` ended: with what its work gave, or with a `failure` in words."""
 
@@ -75,9 +82,7 @@ class Cluster(AbstractPlace):
     """
 
     def __init__(self, address: str, tell: Callable[[str], None] = lambda line: None):
-        found = _ADDRESS.fullmatch(address)
-        if not found or int(found["port"]) > 65535:
-            raise InputError(f"--scheduler: {shown(address)} is no address; give one as tcp://HOST:8786")
+        check_address(address)
         try:
             import cloudpickle
             import distributed

@@ -121,7 +121,8 @@ def test_laws_share_half_of_the_share_of_what_has_no_name():
     assert not problem.is_possible(first[:2]) and problem.is_possible(first[:1])
 
 
-@pytest.mark.parametrize("missing", ["laws", pytest.param("promising", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("missing", ["laws", "promising"])
 def test_where_there_is_no_law_and_no_expression_an_answer_is_given(monkeypatch, missing):
     """A pendulum that random blows drive is diagnosed to the end where no law is at hand, or none promises anything by
     itself, and no expression is stable: what is told has a name, or none."""
