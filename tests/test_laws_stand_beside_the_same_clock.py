@@ -37,6 +37,7 @@ def test_what_the_likeliest_was_found_beside_is_tried_beside_all(weigher, near, 
     search found, and searched again from there where it is near; so is a law that was not searched for at all."""
     weigher, laws = weigher
     found, (drag, damping, drift) = weigher.found, laws.values()
+    weigher.shared = None
     for c in laws.values():
         found.estimates[c] = [one for one in found.estimates[c] if one.kind != "clock"]
     weigher.weigh_clocks([damping])
@@ -50,6 +51,7 @@ def test_what_the_likeliest_was_found_beside_is_tried_beside_all(weigher, near, 
     if near is not None:
         monkeypatch.setattr(_clocks, "_NEAR", near)
     weigher.weigh_clocks([drag])
+    weigher.share_clocks()
     best, other, third = (found.of(c, "clock") for c in laws.values())
     assert best.log_evidence > own.log_evidence + 10
     if near is None:
@@ -62,9 +64,10 @@ def test_it_is_shared_once(weigher, monkeypatch):
     """What has been tried beside the likeliest's errors is not tried again where nothing likelier was found."""
     weigher, laws = weigher
     weigher.weigh_clocks(list(laws.values()))
+    weigher.share_clocks()
     before = {c: weigher.found.of(c, "clock").log_evidence for c in laws.values()}
     tried = []
     monkeypatch.setattr(_clocks, "weigh_shared_clock", lambda *given: tried.append(given) or [])
-    weigher.weigh_clocks([])
+    weigher.share_clocks()
     assert not tried
     assert {c: weigher.found.of(c, "clock").log_evidence for c in laws.values()} == before

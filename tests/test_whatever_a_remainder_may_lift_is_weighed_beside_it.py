@@ -43,6 +43,7 @@ def tried(monkeypatch, evidences, kind, gain):
         estimate(pair, "coloured", evidence + 0.1)
     weigher = Weigher(Stepper(p, 1), found)
     monkeypatch.setattr(weigher, f"weigh_{kind}" if kind == "static" else "weigh_clocks", weigh)
+    monkeypatch.setattr(weigher, "share_clocks", lambda: None)
     remainders = Remainders(weigher, lambda said: None)
     remainders.weigh_static() if kind == "static" else remainders.weigh_clocks()
     return pairs, [c for c in some if c]

@@ -18,22 +18,25 @@ from ._weighed import Estimate
 if TYPE_CHECKING:
     from ._weigher import Weigher
 
-# How often errors are shared at most, from a likelier estimate each time; how many combinations are searched again, and
-# how many nats these may lie behind the best.
-_ROUNDS, _MOST, _NEAR = 3, 6, 6.0
+# How often errors are shared at most, from a likelier estimate each time; how many combinations are searched again, how
+# many nats these may lie behind the best, and how many they must have gained.
+_ROUNDS, _MOST, _NEAR, _GAINED = 2, 6, 6.0, 1.0
 
 
 def weigh_clocks(weigher: "Weigher", combinations: Sequence[Combination]) -> None:
-    """Weigh combinations, fitted before, where the clock may run ahead and behind beside a coloured error; and where
-    one of them is the likeliest of this kind, everything beside its errors."""
-    shared = _likeliest(weigher.found)
-    _search(weigher, combinations, shared)
+    """Weigh combinations, fitted before, where the clock may run ahead and behind beside a coloured error."""
+    _search(weigher, combinations, _likeliest(weigher.found))
+
+
+def share_clocks(weigher: "Weigher") -> None:
+    """Weigh everything beside the errors of sensor and clock of the likeliest estimate of this kind, where these are
+    new."""
     for _ in range(_ROUNDS):
         like = _likeliest(weigher.found)
-        if like is None or (shared is not None and (like.colours, like.clocks) == (shared.colours, shared.clocks)):
+        if like is None or (like.colours, like.clocks) == weigher.shared:
             return
         _search(weigher, _beside(weigher, like), like)
-        shared = like
+        weigher.shared = like.colours, like.clocks
 
 
 def _likeliest(found: Found) -> Estimate | None:
@@ -62,5 +65,5 @@ def _beside(weigher: "Weigher", like: Estimate) -> list[Combination]:
     for one in weigh_shared_clock(weigher.problem, weigher.as_fitted(others), found.priors, weigher.rows, like):
         weigher.add_beside_white(one)
     top = max(map(found.odds, found.estimates))
-    better = [c for c in others if (one := found.of(c, "clock")) and one.log_evidence > own[c]]
+    better = [c for c in others if (one := found.of(c, "clock")) and one.log_evidence > own[c] + _GAINED]
     return sorted((c for c in better if found.odds(c) > top - _NEAR), key=found.odds, reverse=True)[:_MOST]

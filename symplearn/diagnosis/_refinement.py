@@ -111,6 +111,7 @@ class Refinement:
             self.weigher.weigh(new, whole=True)
         if rest.kind == "clock" and some:
             self.weigher.weigh_clocks(list(some))
+            self.weigher.share_clocks()
 
     def _bases(self, ranked: Sequence[Combination]) -> list[Combination]:
         """The best of every size, and the best without an unseen oscillator, which no exchange takes out."""

@@ -40,6 +40,7 @@ class Remainders:
             before = {c: self.found.odds(c) for c in ranked}
             self.weigher.weigh_clocks(first)
             self.weigher.weigh_clocks(self._lifted(first, before, "clock")[:_CLOCKS])
+            self.weigher.share_clocks()
 
     def weigh_static(self) -> None:
         """The best combinations again beside a force that goes with place, which any of their forces may stand for; not

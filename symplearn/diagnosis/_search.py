@@ -199,6 +199,7 @@ class Search:
         """Find the likeliest about their own optima."""
         if self.in_time():
             self.progress("following the likeliest to their own optima")
+            self.weigher.share_clocks()
             settle(self.weigher, self._is_mine)
 
     def goes_on(self, stepper: Stepper, priors: Priors) -> None:

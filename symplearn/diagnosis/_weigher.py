@@ -10,7 +10,8 @@ from .._effects import OUTLIERS, STOP
 from ._along import along, readings
 from ._calibrate import Fits, Priors, grow, residuals, weights
 from ._clock import weigh_known_clock
-from ._clocks import weigh_clocks
+from ._clocks import share_clocks, weigh_clocks
+from ._coloured import Colour
 from ._found import Found
 from ._jitter import weigh_jitter
 from ._noisy import PathFit, fit_paths
@@ -51,6 +52,8 @@ class Weigher:
         self.owed: dict[Combination, float] = {}
         self.owed_along = 0.0
         self.flagged = [np.zeros_like(r.readings, bool) for r in stepper.problem.rows]
+        # Errors of sensor and clock that everything was weighed beside, if any.
+        self.shared: tuple[tuple[Colour, ...], tuple[Colour, ...]] | None = None
 
     @property
     def problem(self) -> Problem:
@@ -61,7 +64,7 @@ class Weigher:
         self.plain = self.stepper = stepper
         if any(bad.any() for bad in self.flagged):
             self.stepper = stepper.on(stepper.problem.without(self.flagged))
-        self.found = found
+        self.found, self.shared = found, None
 
     def take_out_outliers(self, fits: Sequence[PathFit], priors: Priors, spared: frozenset[int] = frozenset()) -> bool:
         """Leave out the readings that lie far off the path that is likeliest without them, but for the columns that are
@@ -168,6 +171,10 @@ class Weigher:
     def weigh_clocks(self, combinations: Sequence[Combination]) -> None:
         """Weigh combinations, fitted before, where the clock may run ahead and behind beside a coloured error."""
         weigh_clocks(self, combinations)
+
+    def share_clocks(self) -> None:
+        """Weigh all combinations beside the errors of sensor and clock of the likeliest of these estimates."""
+        share_clocks(self)
 
     def weigh_static(self, combinations: Sequence[Combination]) -> None:
         """Weigh combinations, fitted before, beside a small force that goes with place."""
