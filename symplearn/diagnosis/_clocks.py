@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 # How often errors are shared at most, from a likelier estimate each time; how many combinations are searched again, how
 # many nats these may lie behind the best, and how many they must have gained.
 _ROUNDS, _MOST, _NEAR, _GAINED = 2, 6, 6.0, 1.0
+# Nats behind the best beside errors that are another's, from which on a combination's own are not searched for: they
+# have given up to 17 more.
+_FAR = 25.0
 
 
 def weigh_clocks(weigher: "Weigher", combinations: Sequence[Combination]) -> None:
@@ -28,20 +31,42 @@ def weigh_clocks(weigher: "Weigher", combinations: Sequence[Combination]) -> Non
     _search(weigher, combinations, _likeliest(weigher.found))
 
 
+def weigh_later_clocks(weigher: "Weigher", combinations: Sequence[Combination]) -> None:
+    """The same after others were searched for such errors: those that stay far behind beside the likeliest one's have no
+    search of their own."""
+    like, found = _likeliest(weigher.found), weigher.found
+    if like is not None:
+        _weigh_beside(weigher, combinations, like)
+        least = max(map(found.odds, found.estimates)) - _FAR
+        combinations = [c for c in combinations if not _evidence(found, c) + found.prices.log(c) < least]
+    _search(weigher, combinations, like)
+
+
 def share_clocks(weigher: "Weigher") -> None:
     """Weigh everything beside the errors of sensor and clock of the likeliest estimate of this kind, where these are
-    new."""
+    new; what gains and is near the best is searched again from there."""
+    found, base = weigher.found, set(weigher.base)
     for _ in range(_ROUNDS):
-        like = _likeliest(weigher.found)
+        like = _likeliest(found)
         if like is None or (like.colours, like.clocks) == weigher.shared:
             return
-        _search(weigher, _beside(weigher, like), like)
         weigher.shared = like.colours, like.clocks
+        others = [c for c in found.estimates if base <= set(c) and c != like.combination]  # fitted to the same readings
+        before = {c: _evidence(found, c) for c in others}
+        _weigh_beside(weigher, others, like)
+        least = max(map(found.odds, found.estimates)) - _NEAR
+        near = [c for c in others if _evidence(found, c) > before[c] + _GAINED and found.odds(c) > least]
+        _search(weigher, sorted(near, key=found.odds, reverse=True)[:_MOST], like)
 
 
 def _likeliest(found: Found) -> Estimate | None:
     every = (one for estimates in found.estimates.values() for one in estimates if one.kind == "clock")
     return max(every, key=lambda one: one.log_evidence, default=None)
+
+
+def _evidence(found: Found, combination: Combination) -> float:
+    one = found.of(combination, "clock")
+    return -np.inf if one is None else one.log_evidence
 
 
 def _search(weigher: "Weigher", combinations: Sequence[Combination], like: Estimate | None) -> None:
@@ -53,17 +78,10 @@ def _search(weigher: "Weigher", combinations: Sequence[Combination], like: Estim
             weigher.add_beside_white(one)
 
 
-def _beside(weigher: "Weigher", like: Estimate) -> list[Combination]:
-    """Weigh everything that was fitted to the same readings beside the errors that an estimate has; of what does better
-    than beside its own, what is near the best."""
-    found, base = weigher.found, set(weigher.base)
-    fitted = [c for c in found.estimates if (white := found.of(c, "white")) and np.isfinite(white.log_evidence)]
-    others = [c for c in fitted if base <= set(c) and c != like.combination and found.of(c, "coloured")]
-    if not others:
-        return []
-    own = {c: one.log_evidence if (one := found.of(c, "clock")) else -np.inf for c in others}
-    for one in weigh_shared_clock(weigher.problem, weigher.as_fitted(others), found.priors, weigher.rows, like):
-        weigher.add_beside_white(one)
-    top = max(map(found.odds, found.estimates))
-    better = [c for c in others if (one := found.of(c, "clock")) and one.log_evidence > own[c] + _GAINED]
-    return sorted((c for c in better if found.odds(c) > top - _NEAR), key=found.odds, reverse=True)[:_MOST]
+def _weigh_beside(weigher: "Weigher", combinations: Sequence[Combination], like: Estimate) -> None:
+    """Weigh combinations beside the errors that an estimate has."""
+    found = weigher.found
+    fitted = [c for c in combinations if (white := found.of(c, "white")) and np.isfinite(white.log_evidence)]
+    if own := [c for c in fitted if found.of(c, "coloured")]:
+        for one in weigh_shared_clock(weigher.problem, weigher.as_fitted(own), found.priors, weigher.rows, like):
+            weigher.add_beside_white(one)

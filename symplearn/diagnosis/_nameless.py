@@ -237,7 +237,7 @@ def _weigh_beside_remainders(search: Search, members: Sequence[int]) -> None:
         return
     kinds = {e.kind for es in found.estimates.values() for e in es}
     if "clock" in kinds:
-        search.weigher.weigh_clocks(near)
+        search.weigher.weigh_later_clocks(near)
     if "static" in kinds:
         search.weigher.weigh_static(near)
     search.add_forces(near[:1], 2)

@@ -110,7 +110,7 @@ class Refinement:
         if new := [start for c, start in some.items() if c not in self.found.estimates]:
             self.weigher.weigh(new, whole=True)
         if rest.kind == "clock" and some:
-            self.weigher.weigh_clocks(list(some))
+            self.weigher.weigh_later_clocks(list(some))
             self.weigher.share_clocks()
 
     def _bases(self, ranked: Sequence[Combination]) -> list[Combination]:

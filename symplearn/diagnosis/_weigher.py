@@ -10,7 +10,7 @@ from .._effects import OUTLIERS, STOP
 from ._along import along, readings
 from ._calibrate import Fits, Priors, grow, residuals, weights
 from ._clock import weigh_known_clock
-from ._clocks import share_clocks, weigh_clocks
+from ._clocks import share_clocks, weigh_clocks, weigh_later_clocks
 from ._coloured import Colour
 from ._found import Found
 from ._jitter import weigh_jitter
@@ -171,6 +171,10 @@ class Weigher:
     def weigh_clocks(self, combinations: Sequence[Combination]) -> None:
         """Weigh combinations, fitted before, where the clock may run ahead and behind beside a coloured error."""
         weigh_clocks(self, combinations)
+
+    def weigh_later_clocks(self, combinations: Sequence[Combination]) -> None:
+        """The same after others were, of those alone that come near beside the likeliest one's errors."""
+        weigh_later_clocks(self, combinations)
 
     def share_clocks(self) -> None:
         """Weigh all combinations beside the errors of sensor and clock of the likeliest of these estimates."""
