@@ -32,8 +32,8 @@ def weigh_clocks(weigher: "Weigher", combinations: Sequence[Combination]) -> Non
 
 
 def weigh_later_clocks(weigher: "Weigher", combinations: Sequence[Combination]) -> None:
-    """The same after others were searched for such errors: those that stay far behind beside the likeliest one's have no
-    search of their own."""
+    """The same after others were searched for such errors: what stays far behind beside the likeliest one's has no
+    search of its own."""
     like, found = _likeliest(weigher.found), weigher.found
     if like is not None:
         _weigh_beside(weigher, combinations, like)
