@@ -18,12 +18,12 @@ from ._weighed import Estimate
 if TYPE_CHECKING:
     from ._weigher import Weigher
 
-# How often errors are shared at most, from a likelier estimate each time; how many combinations are searched again, how
-# many nats these may lie behind the best, and how many they must have gained.
-_ROUNDS, _MOST, _NEAR, _GAINED = 2, 6, 6.0, 1.0
+# How often errors are shared at most, from a likelier estimate each time; how many nats a combination that is searched
+# again may lie behind the best, and how many it must have gained.
+_ROUNDS, _NEAR, _GAINED = 2, 6.0, 1.0
 # Nats behind the best beside errors that are another's, from which on a combination's own are not searched for: they
-# have given up to 17 more.
-_FAR = 25.0
+# have given up to 17 more. How many are searched at once at most.
+_FAR, _MOST = 25.0, 6
 
 
 def weigh_clocks(weigher: "Weigher", combinations: Sequence[Combination]) -> None:
@@ -32,13 +32,14 @@ def weigh_clocks(weigher: "Weigher", combinations: Sequence[Combination]) -> Non
 
 
 def weigh_later_clocks(weigher: "Weigher", combinations: Sequence[Combination]) -> None:
-    """The same after others were searched for such errors: what stays far behind beside the likeliest one's has no
-    search of its own."""
+    """The same after others were searched for such errors: all beside the likeliest one's, and a few that come near
+    there searched themselves."""
     like, found = _likeliest(weigher.found), weigher.found
     if like is not None:
         _weigh_beside(weigher, combinations, like)
+        odds = {c: _evidence(found, c) + found.prices.log(c) for c in combinations}
         least = max(map(found.odds, found.estimates)) - _FAR
-        combinations = [c for c in combinations if not _evidence(found, c) + found.prices.log(c) < least]
+        combinations = sorted((c for c in combinations if odds[c] > least), key=lambda c: -odds[c])[:_MOST]
     _search(weigher, combinations, like)
 
 
