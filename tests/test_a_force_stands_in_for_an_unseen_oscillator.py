@@ -1,10 +1,13 @@
-"""The push of an unseen oscillator has a line, at which a periodic force is tried in its place."""
+"""The push of an unseen oscillator has a line, at which a periodic force is tried in its place; so is an oscillator in
+the place of a force."""
 
 import engine_cases as cases
 import numpy as np
 import pytest
 
 from symplearn.diagnosis._driven import _line, as_driven
+from symplearn.diagnosis._prospects import MANY, Prospects
+from symplearn.diagnosis._refinement import Refinement
 from symplearn.diagnosis._score import Start
 from symplearn.diagnosis._start import priors_without_effects
 
@@ -45,3 +48,30 @@ def test_a_force_takes_the_place():
     assert one.converged and one.z[p.slots + 2] == pytest.approx(OMEGA, abs=0.005)
     assert one.log_evidence > w.found.of(hidden, "white").log_evidence
     assert as_driven(w, force) == []
+
+
+def test_an_oscillator_takes_the_place():
+    """Of a spring joined to a slightly faster oscillator at rest, with which it beats (DOP853), a periodic force alone
+    was fitted, since so strong a coupling promises too little about a motion that lacks it: an oscillator is tried in
+    the force's place, is far likelier, and has the true frequency. In the place of a damping none is tried."""
+    kappa, omega, times = 0.13, 1.06, np.linspace(0.0, 60.0, 300)
+    rates = lambda t, x: [x[2], x[3], -x[0] + kappa * x[1], -(omega**2) * x[1] + kappa * x[0]]  # noqa: E731
+    path = cases.solved(rates, [1.0, 0.0, 0.0, 0.0], times)
+    readings = path[:, 0] + 0.04 * np.random.default_rng(1).normal(size=len(times))
+    file = cases.simulation("p**2/2 + q**2/2", more="[recording.noise]\ny = 0.04")
+    p = cases.problem(file, [cases.recorded(times, readings)], 0.1)
+    w = cases.weigher(p, path[:, 0], path[:, 2])
+    members = {p.candidate(m).effect.name: m for m in p.searched if p.candidate(m).targets == ("q",)}
+    hidden, force, damping = ((members[name],) for name in ("hidden_oscillator", "periodic_forcing", "viscous_damping"))
+    z = priors_without_effects(p).mean.copy()
+    z[0] = 1.0
+    w.weigh([Start((), z, 0.0), Start(damping, z, 0.0)], whole=True)
+    prospects = Prospects(w)
+    promised = {s.combination: s for s in sorted(prospects.about((), MANY), key=lambda s: s.gain)}
+    w.weigh([promised[force]], whole=True)
+    refinement = Refinement(prospects, lambda line: None)
+    assert refinement._joined(damping) == []
+    refinement.move_modes(1)
+    one, other = (w.found.of(c, "white") for c in (hidden, force))
+    assert one.converged and one.log_evidence > other.log_evidence + 20
+    assert one.z[p.slots + 1] == pytest.approx(omega, abs=0.01)

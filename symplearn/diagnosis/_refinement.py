@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from .._effects import STOP, Memory
+from .._effects import HIDDEN, STOP, Memory, Oscillating
 from ._depths import along_the_depths
 from ._driven import as_driven
 from ._found import Found, speaker
@@ -22,6 +22,8 @@ from ._weigher import KEPT, Weigher
 _MOVED, _NEAR = 3, 8.0
 # How far behind the best of its size one with an unseen oscillator may be to be tried stiffer, and starts of such.
 _SOFT, _STIFFER = 100.0, 20
+# What an unseen oscillator must promise in place of something else, and frequencies of it that are tried.
+_PROMISED, _PLACES = 2.0, 2
 # Standard deviations between places of one effect in two fits that stopped at different ones.
 _ELSEWHERE = 3.0
 # Steps of what fades, as shares of how fast it does.
@@ -67,15 +69,42 @@ class Refinement:
 
     def move_modes(self, size: int) -> None:
         """Try the best of a size that have an unseen oscillator with more of the stiffness seen or less, and with a
-        periodic force instead."""
-        size += len(self.weigher.base)
-        ranked = sorted((c for c in self._mine() if len(c) == size), key=self.found.best, reverse=True)
-        near = [c for c in ranked if self.found.best(c) > self.found.best(ranked[0]) - _SOFT]
+        periodic force instead; and the other way round."""
+        if joined := [start for c in self._near(size)[:_MOVED] for start in self._joined(c)]:
+            self.progress("trying what is unseen in place of what swings by itself")
+            self.weigher.weigh(joined, whole=True)
+        near = self._near(size)
         driven = [start for c in near[:_MOVED] for start in as_driven(self.weigher, c)]
         starts = [start for c in near for start in along_the_modes(self.weigher, c)][:_STIFFER]
         if starts or driven:
             self.progress("moving stiffness between what is seen and what is not")
             self.weigher.weigh([*starts, *driven], whole=True)
+
+    def _near(self, size: int) -> list[Combination]:
+        """The best of a size, and those not far behind it."""
+        size += len(self.weigher.base)
+        ranked = sorted((c for c in self._mine() if len(c) == size), key=self.found.best, reverse=True)
+        return [c for c in ranked if self.found.best(c) > self.found.best(ranked[0]) - _SOFT]
+
+    def _joined(self, combination: Combination) -> list[Start]:
+        """A combination with an unseen oscillator in place of a member that swings by a clock of its own, where a fit
+        without that member promises most: what both would do is linear in a force, and hardly in a coupling, so that
+        the force promises more about a motion that is far off, and no exchange takes an oscillator in."""
+        out = list[Start]()
+        for member in combination:
+            rest = tuple(m for m in combination if m != member)
+            if (
+                not isinstance(self.problem.candidate(member).effect, Oscillating)
+                or self.found.of(rest, "white") is None
+            ):
+                continue
+            some = [s for s in self.prospects.about(rest, MANY) if s.combination not in self.found.estimates
+                    and s.gain > _PROMISED and self._has_unseen(s.combination)]  # fmt: skip
+            out += sorted(some, key=lambda s: -s.gain)[:_PLACES]
+        return out
+
+    def _has_unseen(self, combination: Combination) -> bool:
+        return any(self.problem.candidate(m).effect is HIDDEN for m in combination)
 
     def weigh_like_the_best(self) -> None:
         """What may do as well as the likeliest of every size: some fell behind on the way, from where they began."""
