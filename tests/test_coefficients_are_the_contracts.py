@@ -8,7 +8,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from symplearn._effects import EFFECTS, Oscillating
-from symplearn.diagnosis._coefficients import _summary
+from symplearn.diagnosis._coefficients import _counted, _summary
+from symplearn.diagnosis._scatter import outliers
 
 AMOUNT = st.floats(1e-3, 1e3)
 FREQUENCY = st.floats(1e-2, 1e2)
@@ -75,3 +76,20 @@ def test_an_interval_of_a_phase_is_about_its_mean(middle):
     # Of 4000 draws mean and quantiles are known to 0.003 and 0.008; held to six and four times that.
     assert abs(math.remainder(told["mean"] - middle, 2 * math.pi)) < 0.02 and -math.pi < told["mean"] <= math.pi
     assert told["interval95"] == pytest.approx([told["mean"] - 0.392, told["mean"] + 0.392], abs=0.03)
+
+
+def test_what_a_few_outliers_say_has_honest_intervals():
+    """Of ten outliers among three hundred readings, on average, share and size lie in their intervals as often as these
+    claim, and a wrong noise of twelve readings does: over a thousand draws."""
+    rng, held, number = np.random.default_rng(4), [], 300
+    for _ in range(1000):
+        is_off = rng.random(number) < 1 / 30
+        errors = rng.normal(size=number) * np.where(is_off, np.hypot(1.0, 8.0), 1.0)
+        share, size = outliers(errors, np.abs(errors) > 3.5)
+        few = rng.normal(size=12)
+        told = [*(_counted(name, {"e": share, "sd": size}, 300.0) for name in ("e", "sd")),
+                _counted("s", {"s": float(np.sqrt(np.mean(few**2)))}, 12.0)]  # fmt: skip
+        ends = [one["interval95"] for one in told]
+        held.append([low < true < high for (low, high), true in zip(ends, (1 / 30, 8.0, 1.0), strict=True)])
+    # Four standard deviations of a count of a thousand.
+    np.testing.assert_allclose(np.mean(held, axis=0), 0.95, atol=0.028)

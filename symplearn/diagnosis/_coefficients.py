@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm, truncnorm
+from scipy.stats import beta, chi2, norm, truncnorm
 
 from .._effects import NOISE, Candidate
 from ._calibrate import Priors
@@ -12,6 +12,8 @@ from ._problem import Problem
 from ._weighed import Estimate, Mode
 
 _DRAWS = 4000
+# Standard deviations of the noise beyond which an outlier shows as one.
+_STANDS_OUT = 3.0
 
 
 def values_of(problem: Problem, estimate: Estimate, member: int) -> dict[str, float]:
@@ -32,7 +34,8 @@ def coefficients(
     values = values_of(problem, estimate, member)
     if one.effect.amplitudes == 0:
         number = sum(float((r.counts[: r.fitted, one.place] > 0).sum()) for r in problem.rows)
-        return {name: _told(value, _sd(name, values, max(number, 1.0))) for name, value in values.items()}
+        noise = float(estimate.noise[one.place])
+        return {name: _counted(name, values, max(number, 1.0), noise) for name in values}
     place = dict(problem.placed(estimate.combination))[member]
     if one.effect.size == 1:
         return {one.effect.coefficients[0]: _single(problem, estimate, place.start, inflation)}
@@ -49,15 +52,23 @@ def _scatter(problem: Problem, estimate: Estimate, one: Candidate) -> dict[str, 
     return dict(zip(("e", "sd"), estimate.outliers[one.place], strict=True))
 
 
-def _sd(name: str, values: dict[str, float], number: float) -> float:
-    """Standard deviation of a factor of the noise, of a share, or of a size, from so many readings."""
+def _counted(name: str, values: dict[str, Any], number: float, noise: float = 1.0) -> dict[str, Any]:
+    """A factor of the noise, a share of outliers or their size, from so many readings; few of them leave it skewed.
+
+    The interval of a share is that of Jeffreys' prior (Brown, Cai and DasGupta 2001), that of a standard deviation by
+    the chi-square law of its square. Of outliers only those count that stand out of the noise.
+    """
+    value, share, told = values[name], values.get("e", 1.0), number
+    if "e" in values:
+        told = number * 2 * norm.sf(_STANDS_OUT / np.hypot(1.0, values["sd"] / noise))
+    some = max(told * share, 1.0)
     if name == "e":
-        return float(np.sqrt(values["e"] * (1 - values["e"]) / number))
-    return float(values[name] / np.sqrt(2 * max(number * values.get("e", 1.0), 1.0)))
-
-
-def _told(value: float, sd: float) -> dict[str, Any]:
-    return {"mean": value, "sd": float(sd), "interval95": [max(0.0, value - 1.96 * sd), value + 1.96 * float(sd)]}
+        sd = np.sqrt(value * (1 - value) / told)
+        low, high = beta.ppf([0.025, 0.975], some + 0.5, max(told - some, 0.0) + 0.5)
+    else:
+        sd = value / np.sqrt(2 * some)
+        low, high = value * np.sqrt(some / chi2.ppf([0.975, 0.025], some))
+    return {"mean": value, "sd": float(sd), "interval95": [float(low), float(high)]}
 
 
 def _single(problem: Problem, estimate: Estimate, place: int, inflation: float) -> dict[str, Any]:
