@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .._lane_loops import with_lane_loops
 from ._calibrate import Fits
 from ._coloured import (
     MOST_ROWS,
@@ -36,7 +37,8 @@ _DAMPINGS, _TIMES = (30.0, 1.001), 5
 _NEARBY = np.random.default_rng(0).normal(size=(len(_DAMPINGS) * _TIMES * len(RATIOS), 2, 3)) * [1.0, 1.0, 0.0]
 _FINER = (1.0, 0.5, 0.25)
 
-_whitened = jax.jit(whitened)
+_whitened = jax.jit(with_lane_loops(whitened))
+# Many points in step are as fast without (0.07 s against 0.10 of 121 points in 2001 rows).
 _on_grid = jax.jit(jax.vmap(whitened, (None, None, None, None, 0)))
 
 
