@@ -1,5 +1,7 @@
 """Simple laws of force that the vocabulary has no word for are weighed beside it, and told as unnamed forces."""
 
+from dataclasses import replace
+
 import engine_cases as cases
 import numpy as np
 import pytest
@@ -7,8 +9,12 @@ import sympy
 
 from symplearn.diagnosis import Options, _nameless, diagnose
 from symplearn.diagnosis._build import Restriction, augmented_equations, build
+from symplearn.diagnosis._found import Ahead, Found
 from symplearn.diagnosis._laws import laws, priced
+from symplearn.diagnosis._posterior import posterior
 from symplearn.diagnosis._prices import Prices
+from symplearn.diagnosis._start import priors_without_effects
+from symplearn.diagnosis._weighed import Estimate
 
 TWO = "(p1**2/m + p2**2 + 4*x1**2 + 9*x2**2)/2"
 FRICTION = ("viscous_damping", "quadratic_drag", "coulomb_friction", "unnamed_force")
@@ -119,6 +125,46 @@ def test_laws_share_half_of_the_share_of_what_has_no_name():
     assert sum(np.exp(prices.log((m,))) for m in members) == pytest.approx(prices.remainder / 2)
     first = [m for m in members if problem.candidate(m).places == (0,)]
     assert not problem.is_possible(first[:2]) and problem.is_possible(first[:1])
+
+
+@pytest.fixture(scope="module")
+def beside():
+    """Two oscillators with all laws: the problem, two laws on different coordinates, a damping and outliers."""
+    file, times = two(), np.linspace(0.0, 5.0, 30)
+    run = cases.recorded(times, np.cos(np.stack([times, times], axis=1)), columns=("a", "b"))
+    every = priced(laws(file))
+    p = build(file, augmented_equations(file, nameless=every), [run], 0.0, 0.1, Restriction())
+    number = len(p.equations.candidates)
+    law, other = (next(m for m in range(number - len(every), number) if p.candidate(m).places == (i,)) for i in (0, 1))
+    named = {p.candidate(m).effect.name: m for m in reversed(p.searched)}
+    return p, law, other, named["viscous_damping"], named["sensor_outliers"]
+
+
+def test_beside_names_what_has_none_is_rarer(beside):
+    """A law and a damping have a fifth of the product of their priors; two laws, or a law beside outliers, which are of
+    the readings, have all of it."""
+    p, law, other, damping, bad = beside
+    prices = Prices(p)
+    for some, share in (((damping, law), 0.2), ((law, other), 1.0), ((bad, law), 1.0), ((damping, bad), 1.0)):
+        product = sum(prices.log((m,)) for m in some) + np.log(share)
+        assert prices.log(tuple(sorted(some))) == pytest.approx(product, rel=1e-12)
+
+
+@pytest.mark.parametrize(("score", "counts"), [(0.0, -5.0), (-9.0, -9.0)], ids=["better", "worse"])
+def test_a_law_gains_nothing_by_running_on_better(beside, score, counts):
+    """Of a law and a damping of equal evidence, whose run ahead is scored -5, the law's score is no more than that, and
+    less where its run is worse."""
+    p, law, _, damping, _ = beside
+    found = Found(p, replace(priors_without_effects(p), scales=np.ones(p.equations.size)))
+    for c in ((), (law,), (damping,)):
+        z, spread = np.ones(p.size), 0.01 * np.eye(p.size)
+        for kind in ("white", "coloured"):
+            found.add(Estimate(c, kind, z, spread, np.ones(p.channels), 0.0, True))
+    found.ahead = {(): Ahead(-8.0, True, False), (law,): Ahead(score, True, True), (damping,): Ahead(-5.0, True, True)}
+    odds = {w.combination: w.probability for w in posterior(p, found, 1.0).named}
+    prior = found.prices.log((law,)) - found.prices.log((damping,))
+    # The round-off of logarithms of ratios.
+    assert np.log(odds[(law,)] / odds[(damping,)]) == pytest.approx(prior + counts + 5.0, rel=1e-9)
 
 
 @pytest.mark.slow
