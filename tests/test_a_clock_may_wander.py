@@ -4,14 +4,16 @@ import itertools
 from dataclasses import replace
 
 import engine_cases as cases
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import solve_triangular
 from test_coloured_errors_are_whitened import autocovariance, irregular_times
 
 from symplearn.diagnosis._calibrate import calibrate
 from symplearn.diagnosis._clock import weigh_clock
-from symplearn.diagnosis._clock_errors import Piece, cleared
-from symplearn.diagnosis._coloured import Colour
+from symplearn.diagnosis._clock_errors import Piece, _on_grid, cleared
+from symplearn.diagnosis._coloured import Colour, filled
 from symplearn.diagnosis._found import Found
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
@@ -43,6 +45,28 @@ def test_sensor_and_clock_are_integrated_out_together():
     # Covariances of condition up to 1e5 cost the dense solution five of sixteen digits, here and in the determinant.
     np.testing.assert_allclose(series.T @ series, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
     assert log == pytest.approx(np.linalg.slogdet(S)[1], rel=1e-8)
+
+
+def test_many_errors_at_once_are_each_the_cholesky_factors():
+    """A column's whitened innovations beside three pairs of errors are the dense covariance's Cholesky factor solved,
+    and the logs are its determinant's; a quarter of the irregular rows is missing."""
+    rng, times = np.random.default_rng(3), irregular_times()
+    weight, rates, y = rng.uniform(0.5, 20.0, len(times)), rng.normal(size=len(times)), rng.normal(size=len(times))
+    weight[::4] = 0.0
+    other = (Colour(2.0, 0.7, 30.0, 0.0), Colour(5.0, 3.0, 0.3, 0.0))
+    pairs = [BOTH, other, (Colour(0.0, 1.0, 1.001, 0.0), BOTH[1])]
+    shapes = np.array([[(one.ratio, one.frequency, one.damping) for one in pair] for pair in pairs])
+    piece = Piece(y[None], rates, weight, times)
+    found, logs = _on_grid(filled(y), *piece.rows, tuple(jnp.asarray(part) for part in np.moveaxis(shapes, 2, 0)))
+    seen, lags = weight > 0, times[:, None] - times
+    for pair, ours, log in zip(pairs, np.asarray(found), np.asarray(logs), strict=True):
+        sensor, clock = (one.ratio * autocovariance(lags, one.frequency, one.damping) for one in pair)
+        S = (sensor + np.outer(rates, rates) * clock)[np.ix_(seen, seen)] + np.diag(1 / weight[seen])
+        root = np.linalg.cholesky(S)
+        expected = solve_triangular(root, y[seen], lower=True)
+        # As above.
+        np.testing.assert_allclose(ours[: len(times)][seen], expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
+        assert log == pytest.approx(2 * np.log(np.diag(root)).sum(), rel=1e-8)
 
 
 def late(seed):

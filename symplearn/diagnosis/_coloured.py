@@ -48,7 +48,7 @@ class Colour:
     occam: float
 
 
-def _transition(gap: Array, frequency: Array, damping: Array) -> Array:
+def transition(gap: Array, frequency: Array, damping: Array) -> Array:
     """exp of the damped oscillator's matrix over `gap`, without overflow at strong damping. Shape (2, 2)."""
     rate = damping * frequency
     split = frequency * jnp.sqrt(jnp.abs(damping**2 - 1))
@@ -85,7 +85,7 @@ def remembered(columns, loadings, variances, gaps, shapes, visit, start):
         return (F @ M, P, total, logs + jnp.where(seen, jnp.log(S), 0.0)), kept
 
     # Most gaps are alike, and what takes long are exponentials and cosines.
-    each = [jax.vmap(_transition, (0, None, None))(kinds, frequency[i], damping[i]) for i in range(number)]
+    each = [jax.vmap(transition, (0, None, None))(kinds, frequency[i], damping[i]) for i in range(number)]
     transitions = jax.vmap(block_diag)(*each)[places]
     begin = (jnp.zeros((2 * number, columns.shape[0])), stationary, start, jnp.zeros(()))
     (_, _, total, logs), kept = jax.lax.scan(step, begin, (columns.T, loadings.T, variances, transitions))
