@@ -80,9 +80,9 @@ def test_an_interval_of_a_phase_is_about_its_mean(middle):
 
 def test_what_a_few_outliers_say_has_honest_intervals():
     """Of ten outliers among three hundred readings, on average, share and size lie in their intervals as often as these
-    claim, and a wrong noise of twelve readings does: over a thousand draws."""
+    claim, and a wrong noise of twelve readings does: over four hundred draws."""
     rng, held, number = np.random.default_rng(4), [], 300
-    for _ in range(1000):
+    for _ in range(400):
         is_off = rng.random(number) < 1 / 30
         errors = rng.normal(size=number) * np.where(is_off, np.hypot(1.0, 8.0), 1.0)
         share, size = outliers(errors, np.abs(errors) > 3.5)
@@ -91,5 +91,5 @@ def test_what_a_few_outliers_say_has_honest_intervals():
                 _counted("s", {"s": float(np.sqrt(np.mean(few**2)))}, 12.0)]  # fmt: skip
         ends = [one["interval95"] for one in told]
         held.append([low < true < high for (low, high), true in zip(ends, (1 / 30, 8.0, 1.0), strict=True)])
-    # Four standard deviations of a count of a thousand.
-    np.testing.assert_allclose(np.mean(held, axis=0), 0.95, atol=0.028)
+    # Four standard deviations of a count of four hundred.
+    np.testing.assert_allclose(np.mean(held, axis=0), 0.95, atol=0.044)
