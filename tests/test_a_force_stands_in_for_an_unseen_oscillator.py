@@ -74,4 +74,5 @@ def test_an_oscillator_takes_the_place():
     refinement.move_modes(1)
     one, other = (w.found.of(c, "white") for c in (hidden, force))
     assert one.converged and one.log_evidence > other.log_evidence + 20
-    assert one.z[p.slots + 1] == pytest.approx(omega, abs=0.01)
+    # Five of the standard deviations that the fit has of it, 0.0007. Seen: 0.0004.
+    assert one.z[p.slots + 1] == pytest.approx(omega, abs=0.0035)

@@ -113,20 +113,6 @@ def test_every_law_between_two_is_what_it_says():
     assert kinds == {"potential": 4, "across": 2, "between": 1, "along": 1, "own or one-sided": 16, "circulatory": 1}
 
 
-def test_laws_share_half_of_the_share_of_what_has_no_name():
-    """All laws together have half of a family's share of the prior, and of two on one coordinate a combination has
-    one."""
-    file, times = two(), np.linspace(0.0, 5.0, 30)
-    run = cases.recorded(times, np.cos(np.stack([times, times], axis=1)), columns=("a", "b"))
-    every = priced(laws(file))
-    problem = build(file, augmented_equations(file, nameless=every), [run], 0.0, 0.1, Restriction())
-    members = range(len(problem.equations.candidates) - len(every), len(problem.equations.candidates))
-    prices = Prices(problem)
-    assert sum(np.exp(prices.log((m,))) for m in members) == pytest.approx(prices.remainder / 2)
-    first = [m for m in members if problem.candidate(m).places == (0,)]
-    assert not problem.is_possible(first[:2]) and problem.is_possible(first[:1])
-
-
 @pytest.fixture(scope="module")
 def beside():
     """Two oscillators with all laws: the problem, two laws on different coordinates, a damping and outliers."""
@@ -138,6 +124,16 @@ def beside():
     law, other = (next(m for m in range(number - len(every), number) if p.candidate(m).places == (i,)) for i in (0, 1))
     named = {p.candidate(m).effect.name: m for m in reversed(p.searched)}
     return p, law, other, named["viscous_damping"], named["sensor_outliers"]
+
+
+def test_laws_share_half_of_the_share_of_what_has_no_name(beside):
+    """All laws together have half of a family's share of the prior, and of two on one coordinate a combination has
+    one."""
+    problem, prices = beside[0], Prices(beside[0])
+    members = [m for m, one in enumerate(problem.equations.candidates) if one.nameless]
+    assert sum(np.exp(prices.log((m,))) for m in members) == pytest.approx(prices.remainder / 2)
+    first = [m for m in members if problem.candidate(m).places == (0,)]
+    assert not problem.is_possible(first[:2]) and problem.is_possible(first[:1])
 
 
 def test_beside_names_what_has_none_is_rarer(beside):

@@ -134,8 +134,9 @@ def weigh_known_clock(problem: Problem, fits: Fits, priors: Priors, rows: Sequen
     """The only lane beside the errors of sensor and clock that another estimate has, and beside a curve where that has
     one: of its sizes the likeliest, which is granted all of their weight."""
     (lane,) = _Lane.every(problem, fits, priors, rows)
-    tried = _of_each_size(lane.bent(), _both(like), like.noise) if like.bends else [_alone(lane, _both(like))]
-    return _told(lane.bent() if like.bends else lane, max(tried, key=_evidence))
+    lane = lane.bent() if like.bends else lane
+    tried = _of_each_size(lane, _both(like), like.noise) if like.bends else [_alone(lane, _both(like))]
+    return _told(lane, max(tried, key=_evidence))
 
 
 @np.errstate(all="ignore")
