@@ -21,6 +21,7 @@ from ._errors import InputError, nearest, shown
 _LONGEST_LINE = 1_000_000  # characters
 _MOST_ROWS = 20_000_000
 _CHUNK = 2_000  # rows at once; with many more the garbage collector takes most of the time
+_GZIP = "\x1f\udc8b"  # as it begins, its second byte being no UTF-8
 _NUMERIC = frozenset("0123456789+-.eE \t")
 
 
@@ -108,6 +109,8 @@ class _Reader:
         """The lines that are not comments; `self.line` counts them all."""
         while line := stream.readline(_LONGEST_LINE + 1):
             self.line += 1
+            if self.line == 1 and line.startswith(_GZIP):
+                raise InputError(f"{self.name}: is compressed by gzip; give its name the ending .csv.gz")
             if len(line) > _LONGEST_LINE:
                 raise InputError(
                     f"{self.name}, line {self.line}: is longer than {_LONGEST_LINE:,} characters; is it CSV?"

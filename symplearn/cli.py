@@ -25,6 +25,19 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _CORES = os.cpu_count() or 1
+
+
+def _folder_at(name: str | Path) -> Path:
+    """An empty name, as of a variable that was never set, is not the folder that the command runs in. A default is a
+    path already."""
+    if not str(name).strip():
+        raise InputError("--out: is empty; name the folder that the report is to be written to")
+    return Path(name)
+
+
+_Out = Annotated[
+    Path, typer.Option(parser=_folder_at, metavar="<path>", help="Folder of the report, or of the reports.")
+]
 _Positive = Annotated[int, typer.Option(min=1, help="Threads; the answer does not depend on it.")]
 
 
@@ -47,7 +60,7 @@ def _symplearn(
 def diagnose(
     simulation: Annotated[Path, typer.Argument(help="The simulation file (TOML).", show_default=False)],
     recordings: Annotated[list[Path], typer.Argument(help="Recordings (CSV, .csv.gz).", show_default=False)],
-    out: Annotated[Path, typer.Option(help="Folder that the report is written to.")] = Path("diagnosis"),
+    out: _Out = Path("diagnosis"),
     seed: Annotated[int, typer.Option(min=-(2**63), max=2**63 - 1, help="Same seed, same files: same answer.")] = 0,
     holdout: Annotated[float, typer.Option(help="Last part of each recording, kept from every fit.")] = 0.25,
     forecast_until: Annotated[float | None, typer.Option(help="Forecast up to this time.")] = None,
@@ -104,7 +117,7 @@ def diagnose(
 def diagnose_each(
     simulation: Annotated[Path, typer.Argument(help="The simulation file (TOML).", show_default=False)],
     recordings: Annotated[list[Path], typer.Argument(help="Recordings (CSV, .csv.gz).", show_default=False)],
-    out: Annotated[Path, typer.Option(help="Folder of the reports, one folder each.")] = Path("diagnoses"),
+    out: _Out = Path("diagnoses"),
     seed: Annotated[int, typer.Option(min=-(2**63), max=2**63 - 1, help="Same seed, same files: same answer.")] = 0,
     holdout: Annotated[float, typer.Option(help="Last part of each recording, kept from every fit.")] = 0.25,
     effects: Annotated[str | None, typer.Option(help="Search these effects only (comma separated).")] = None,
@@ -172,7 +185,7 @@ def _restriction(effects: str | None, sensor_only: bool, dynamics_only: bool) ->
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder that the report is written to.")] = Path("diagnosis"),
+    out: _Out = Path("diagnosis"),
 ) -> None:
     """Diagnose the case that ships with symplearn: an effect concealed below the reading noise."""
     with resources.as_file(resources.files("symplearn") / "demo") as folder:

@@ -147,6 +147,8 @@ def _check_fits(document, columns, momenta, held_out):
             assert set(fit["holdout_rmse"]) == set(columns)
             for value in (*fit["holdout_rmse"].values(), fit["holdout_log_density"]):
                 number(value)
+            for value in fit["holdout_misfit"].values():
+                number(value, 0)
         else:
             assert fit["holdout_rmse"] is None and fit["holdout_log_density"] is None
         assert set(fit["process_noise_sd"]) >= set(momenta) and set(fit["noise_sd"]) == set(columns)

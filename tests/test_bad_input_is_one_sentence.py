@@ -312,6 +312,9 @@ def test_paths_that_are_no_recording(tmp_path):
     assert "gzip" in refused(lambda: read_recordings(simulation, [packed]), "swing.csv.gz")
     packed.write_bytes(gzip.compress("\n".join(ROWS).encode())[:-20])
     assert "gzip" in refused(lambda: read_recordings(simulation, [packed]), "swing.csv.gz")
+    packed.write_bytes(gzip.compress("\n".join(ROWS).encode()))
+    unnamed = packed.rename(tmp_path / "packed.csv")
+    assert ".csv.gz" in refused(lambda: read_recordings(simulation, [unnamed]), "packed.csv")
     utf16 = tmp_path / "wide.csv"
     utf16.write_bytes("\n".join(ROWS).encode("utf-16"))
     assert "UTF-8" in refused(lambda: read_recordings(simulation, [utf16]), "wide.csv")

@@ -175,7 +175,7 @@ def test_what_is_known_of_it_is_expected_of_later_rows():
     assert missed["bent"] < 1.1 * NOISE and min(missed["white"], missed["unknown"]) > 2 * NOISE
     # Errors of the noise's own size, of which the prediction is sure: as dense as white noise can be, but for a tenth.
     least = norm.logpdf(NOISE * np.random.default_rng(2).normal(size=len(TIMES))[rows[0] :], scale=NOISE).sum()
-    assert outlook(bent).held_out_log_density(1.0) > least - 0.1 * (len(TIMES) - rows[0])
+    assert outlook(bent).held_out(1.0).log_density > least - 0.1 * (len(TIMES) - rows[0])
 
 
 @pytest.mark.slow

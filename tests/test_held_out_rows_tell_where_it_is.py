@@ -118,7 +118,7 @@ def test_held_out_density_knows_that_the_stiffness_is_uncertain(learnt):
     outlook = Outlook(stepper, estimate, 0, np.zeros(1))
     # Start and stiffness together are a third of the noise at most, so that a spread which lacks the half of the
     # start's that the filter takes off, having the rows twice, is within two nats over 50 rows.
-    assert outlook.held_out_log_density(1.0) == pytest.approx(expected, abs=2.0)
+    assert outlook.held_out(1.0).log_density == pytest.approx(expected, abs=2.0)
     variance = outlook._unsure(16.0)[:, 0]
     at = np.argmax(np.abs(slopes).sum(0))
     # All of them together have the start's own share, too, which is in the filter's spread here: less than a half.
@@ -131,7 +131,7 @@ def test_held_out_density_knows_that_the_stiffness_is_uncertain(learnt):
     )
     # The start's own share of a tenth of the noise's variance, which SciPy's leaves out here, is worth a tenth of a
     # nat.
-    assert outlook.held_out_log_density(100.0) == pytest.approx(uncertain, abs=0.5) and known > uncertain + 15
+    assert outlook.held_out(100.0).log_density == pytest.approx(uncertain, abs=0.5) and known > uncertain + 15
 
 
 def test_an_outlier_among_them_moves_little():

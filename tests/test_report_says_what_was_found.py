@@ -58,6 +58,7 @@ def test_numbers_are_those_of_the_document(page):
     fits = [document["fit"][when] for when in ("before", "after")]
     expected = {
         "Held-out rmse, angle_deg [°]": [fit["holdout_rmse"]["angle_deg"] for fit in fits],
+        "Held-out misfit by what is expected, angle_deg": [fit["holdout_misfit"]["angle_deg"] for fit in fits],
         "Held-out log density [nats]": [fit["holdout_log_density"] for fit in fits],
         "Process noise, p": [fit["process_noise_sd"]["p"] for fit in fits],
         "Reading noise, angle_deg [°]": [fit["noise_sd"]["angle_deg"] for fit in fits],
@@ -141,7 +142,7 @@ def hostile():
     answer["warnings"] = [ATTACK]
     answer["next_measurement"] = ATTACK
     for fit in answer["fit"].values():
-        fit |= {"holdout_rmse": {ATTACK: 1.0}, "noise_sd": {ATTACK: 1.0}}
+        fit |= {"holdout_rmse": {ATTACK: 1.0}, "holdout_misfit": {ATTACK: 1.0}, "noise_sd": {ATTACK: 1.0}}
     one = dataclasses.replace(cases.series(rows=60, end=4.0), name=ATTACK)
     return cases.damped_pendulum(
         title=ATTACK,

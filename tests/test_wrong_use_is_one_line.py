@@ -30,6 +30,7 @@ WRONG = {
     "holdout a word": (("--holdout", "half"), "--holdout"),
     "seed a word": (("--seed", "x"), "--seed"),
     "seed without value": (("--seed",), "--seed"),
+    "no folder": (("--out", ""), "--out: is empty"),
     "no jobs": (("--jobs", "0"), "--jobs"),
     "no time": (("--time-limit", "0"), "--time-limit"),
     "both restrictions": (("--sensor-only", "--dynamics-only"), "exclude each other"),

@@ -32,7 +32,7 @@ from ._record import Diagnosis, Forecast, Series
 from ._told import Told
 from ._trajectory import Stepper
 from ._units import coefficient_units, time_unit
-from ._warnings import doubled, set_back, warnings
+from ._warnings import doubled, missed, set_back, warnings
 from ._weighed import Estimate, coloured_inflation
 from ._words import equation_lines, finding_sentence, next_measurement
 
@@ -169,7 +169,8 @@ class Answer:
                 self.with_,
                 self.forecast,
             )
-            + set_back(before, after),
+            + set_back(before, after)
+            + missed(after),
             "thinning": {
                 "rows": sum(r.given for r in self.problem.rows),
                 "used": sum(r.used for r in self.problem.rows),

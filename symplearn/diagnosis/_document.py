@@ -19,6 +19,8 @@ from ._weighed import Estimate
 # Alternatives listed one by one; the rest is `other`.
 _LISTED = 12
 _LEAST = 5e-4
+# Share of the held-out rows, the worst, of which a misfit knows nothing.
+_TRIMMED = 0.05
 # A bound cuts what comes nearer to it than so many standard deviations.
 _FAR = 5.0
 # What is left of it is looked at so many widths from where it is highest, at so many nodes.
@@ -56,7 +58,8 @@ def _between(mean: float, sd: float, lower: float, upper: float) -> dict[str, fl
 def fit(
     problem: Problem, needed: Estimate, outlooks: Sequence[Outlook], recordings: Sequence[Recording], inflation: float
 ) -> dict[str, Any]:
-    """Held-out error of the free run in the columns' units, its log density, and the noises.
+    """Held-out error of the free run in the columns' units and by what was expected of it, its log density, and the
+    noises.
 
     Free run and density are those of `outlooks`. `needed` holds the process noise and the reading noise that it takes
     to follow the fitted rows; a force that acts for a while counts in the mean over them. `inflation` multiplies the
@@ -64,24 +67,35 @@ def fit(
     """
     columns, momenta = problem.equations.columns, problem.equations.momenta
     squares, numbers, density = np.zeros(len(columns)), np.zeros(len(columns)), 0.0
+    against: list[np.ndarray] = []
     for outlook, recording in zip(outlooks, recordings, strict=True):
         held = recording.times > outlook.rows.boundary
         if held.any():
             error = outlook.held_out_errors(recording.times[held], recording.readings[held])
             squares += np.nansum(error**2, axis=0)
             numbers += (~np.isnan(error)).sum(0)
-            density += outlook.held_out_log_density(inflation)
+            told = outlook.held_out(inflation)
+            density += told.log_density
+            against.append(told.squares)
     with np.errstate(invalid="ignore", divide="ignore"):
         rmse = np.sqrt(squares / numbers)
+    misfit = [_root_mean(column) for column in np.concatenate(against).T] if against else []
     held_out = any((r.times > o.rows.boundary).any() for o, r in zip(outlooks, recordings, strict=True))
     exposed = 1.0 if needed.exposures is None else float(np.mean(np.concatenate(needed.exposures)))
     intensity = np.zeros(len(momenta)) if needed.intensity is None else np.sqrt(needed.intensity * exposed)
     return {
         "holdout_rmse": {c: finite(x) for c, x in zip(columns, rmse, strict=True)} if held_out else None,
+        "holdout_misfit": {c: finite(x) for c, x in zip(columns, misfit, strict=True)} if held_out else None,
         "holdout_log_density": finite(density) if held_out else None,
         "process_noise_sd": {p: float(x) for p, x in zip(momenta, intensity, strict=True)},
         "noise_sd": {c: finite(x) for c, x in zip(columns, needed.reading_noise, strict=True)},
     }
+
+
+def _root_mean(squares: Float[np.ndarray, " row"]) -> float:
+    """Without the largest, which may be outliers; NaN where nothing was read."""
+    seen = np.sort(squares[~np.isnan(squares)])
+    return float(np.sqrt(seen[: len(seen) - int(_TRIMMED * len(seen))].mean())) if len(seen) else np.nan
 
 
 def finite(value: float) -> float | None:

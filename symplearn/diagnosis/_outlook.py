@@ -57,6 +57,25 @@ def one_off(problem: Problem, e: Estimate, recording: int, inflation: float) -> 
 
 
 @dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Readings of held-out rows less the free run, NaN where nothing was read, and the variances expected of them."""
+
+    errors: Float[np.ndarray, "held channel"]
+    variances: Float[np.ndarray, "held channel"]
+
+    @property
+    def log_density(self) -> float:
+        """Sum of the log densities of all readings."""
+        terms = -0.5 * (np.log(2 * np.pi * self.variances) + self.errors**2 / self.variances)
+        return float(terms[~np.isnan(self.errors)].sum())
+
+    @property
+    def squares(self) -> Float[np.ndarray, "held channel"]:
+        """Squared errors by what is expected of them."""
+        return self.errors**2 / self.variances
+
+
+@dataclass(frozen=True, eq=False)
 class Outlook:
     """An estimate on one recording. Times, readings and predictions are by row after thinning."""
 
@@ -165,17 +184,14 @@ class Outlook:
             )
         )
 
-    def held_out_log_density(self, inflation: float) -> float:
-        """Sum over held-out rows of the log density of each reading around the free run, with the spread of the filter
-        and of the unknowns; `inflation` multiplies their posterior covariance."""
+    def held_out(self, inflation: float) -> "HeldOut":
+        """How held-out rows lie around the free run, with the spread of the filter and of the unknowns; `inflation`
+        multiplies their posterior covariance."""
         first = self.rows.fitted
         weight = self._roots()[first:] ** 2
         S = np.asarray(self._filtered[1].innovation_covariances[first : len(self.rows.times)])
         variance = np.diagonal(S, axis1=1, axis2=2) / weight + self._unsure(inflation)
-        error = self.rows.readings[first:] - self.readings[first:]
-        seen = ~np.isnan(error)
-        terms = -0.5 * (np.log(2 * np.pi * variance) + np.where(seen, error, 0.0) ** 2 / variance)
-        return float(terms[seen].sum())
+        return HeldOut(self.rows.readings[first:] - self.readings[first:], variance)
 
     def _unsure(self, inflation: float) -> Float[np.ndarray, "held channel"]:
         """Variance of the held-out free run that unknown parameters leave: each of them off by one standard deviation

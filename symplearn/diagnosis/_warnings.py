@@ -22,6 +22,9 @@ from ._weighed import Estimate
 _TOLD = 1 / 1.05
 # A forecast is far off that leaves the middle of what was read by this many times its range.
 _FAR = 10.0
+# Held-out errors of this many times what is expected are no chance: a free run's are of one piece, as two readings,
+# whose mean square is above nine once in eight thousand times.
+_MISSED = 3.0
 # Held-out errors that grow by less than this are as large as before.
 _WORSE = 1.1
 
@@ -108,6 +111,16 @@ def set_back(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
         f"the held-out rows of {name} are missed by more with the findings than without: "
         f"{later[name]:.4g} against {first[name]:.4g}"
         for name in worse
+    ]
+
+
+def missed(fit: Mapping[str, Any]) -> list[str]:
+    """Which readings the held-out run misses by far more than the answer itself expects, of what `fit` tells."""
+    return [
+        f"the held-out rows of {name} are missed by {misfit:.2g} times what is expected of this answer: it does not go "
+        "on as it began, so something is missing in it, or what is held out is another regime"
+        for name, misfit in (fit["holdout_misfit"] or {}).items()
+        if misfit is not None and misfit > _MISSED
     ]
 
 

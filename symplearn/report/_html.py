@@ -90,6 +90,7 @@ def _fit_rows(diagnosis: Diagnosis) -> list[tuple[str, str, str, str]]:
     """Rows of the table of fit numbers: what, before, after, how many times smaller."""
     before, after = diagnosis.document["fit"]["before"], diagnosis.document["fit"]["after"]
     rows = _row_each("Held-out rmse", before["holdout_rmse"], after["holdout_rmse"], diagnosis.units)
+    rows += _row_each("Held-out misfit by what is expected", before["holdout_misfit"], after["holdout_misfit"], {})
     density = before["holdout_log_density"], after["holdout_log_density"]
     rows.append(("Held-out log density [nats]", number(density[0]), number(density[1]), DASH))
     rows += _row_each("Process noise", before["process_noise_sd"], after["process_noise_sd"], {})
