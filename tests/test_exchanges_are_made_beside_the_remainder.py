@@ -13,6 +13,7 @@ from test_coloured_errors_are_whitened import autocovariance
 
 from symplearn.diagnosis._bend import Bend, Form, Shapes
 from symplearn.diagnosis._calibrate import calibrate, weights
+from symplearn.diagnosis._clocks import weigh_clocks
 from symplearn.diagnosis._coloured import Colour
 from symplearn.diagnosis._exchange import Regression
 from symplearn.diagnosis._found import Found
@@ -156,7 +157,7 @@ def test_the_true_law_is_found_beside_a_wandering_clock():
     z = np.zeros(p.size)
     z[[0, p.head]] = 1.0
     weigher.weigh([Start((), z, 0.0), Start(damping, z, 0.0)])
-    weigher.weigh_clocks([(), damping])
+    weigh_clocks(weigher, [(), damping])
     assert drag not in weigher.found.estimates and rows == weigher.rows
     Refinement(Prospects(weigher), lambda line: None).weigh_beside_the_remainder()
     found = weigher.found

@@ -8,6 +8,7 @@ from test_a_clock_may_wander import late, problem, swing
 
 from symplearn.diagnosis import _clocks
 from symplearn.diagnosis._clock import weigh_shared_clock
+from symplearn.diagnosis._clocks import share_clocks, weigh_clocks
 from symplearn.diagnosis._found import Found
 from symplearn.diagnosis._score import Start
 from symplearn.diagnosis._start import priors_without_effects
@@ -40,7 +41,7 @@ def test_what_the_likeliest_was_found_beside_is_tried_beside_all(weigher, near, 
     weigher.shared = None
     for c in laws.values():
         found.estimates[c] = [one for one in found.estimates[c] if one.kind != "clock"]
-    weigher.weigh_clocks([damping])
+    weigh_clocks(weigher, [damping])
     own = found.of(damping, "clock")
     still = replace(own, colours=(replace(own.colours[0], ratio=0.0),), clocks=(replace(own.clocks[0], ratio=0.0),))
     (caught,) = weigh_shared_clock(found.problem, weigher.as_fitted([damping]), found.priors, weigher.rows, still)
@@ -49,8 +50,8 @@ def test_what_the_likeliest_was_found_beside_is_tried_beside_all(weigher, near, 
     found.estimates[damping] = [caught if one is own else one for one in found.estimates[damping]]
     if near is not None:
         monkeypatch.setattr(_clocks, "_NEAR", near)
-    weigher.weigh_clocks([drag])
-    weigher.share_clocks()
+    weigh_clocks(weigher, [drag])
+    share_clocks(weigher)
     best, other, third = (found.of(c, "clock") for c in laws.values())
     assert best.log_evidence > own.log_evidence + 10
     if near is None:
@@ -62,11 +63,11 @@ def test_what_the_likeliest_was_found_beside_is_tried_beside_all(weigher, near, 
 def test_it_is_shared_once(weigher, monkeypatch):
     """What has been tried beside the likeliest's errors is not tried again where nothing likelier was found."""
     weigher, laws = weigher
-    weigher.weigh_clocks(list(laws.values()))
-    weigher.share_clocks()
+    weigh_clocks(weigher, list(laws.values()))
+    share_clocks(weigher)
     before = {c: weigher.found.of(c, "clock").log_evidence for c in laws.values()}
     tried = []
     monkeypatch.setattr(_clocks, "weigh_shared_clock", lambda *given: tried.append(given) or [])
-    weigher.share_clocks()
+    share_clocks(weigher)
     assert not tried
     assert {c: weigher.found.of(c, "clock").log_evidence for c in laws.values()} == before

@@ -8,6 +8,7 @@ import engine_cases as cases
 import numpy as np
 import pytest
 
+from symplearn.diagnosis import _remainders
 from symplearn.diagnosis._found import Found
 from symplearn.diagnosis._remainders import Remainders
 from symplearn.diagnosis._start import priors_without_effects
@@ -42,8 +43,9 @@ def tried(monkeypatch, evidences, kind, gain):
         estimate(pair, "white", evidence)
         estimate(pair, "coloured", evidence + 0.1)
     weigher = Weigher(Stepper(p, 1), found)
-    monkeypatch.setattr(weigher, f"weigh_{kind}" if kind == "static" else "weigh_clocks", weigh)
-    monkeypatch.setattr(weigher, "share_clocks", lambda: None)
+    monkeypatch.setattr(weigher, "weigh_static", weigh)
+    monkeypatch.setattr(_remainders, "weigh_clocks", lambda _, listed: weigh(listed))
+    monkeypatch.setattr(_remainders, "share_clocks", lambda _: None)
     remainders = Remainders(weigher, lambda said: None)
     remainders.weigh_static() if kind == "static" else remainders.weigh_clocks()
     return pairs, [c for c in some if c]

@@ -6,7 +6,6 @@ from there.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,9 +13,7 @@ from ._clock import weigh_clock, weigh_shared_clock
 from ._found import Found
 from ._problem import Combination
 from ._weighed import Estimate
-
-if TYPE_CHECKING:
-    from ._weigher import Weigher
+from ._weigher import Weigher
 
 # How often errors are shared at most, from a likelier estimate each time; how many nats a combination that is searched
 # again may lie behind the best, and how many it must have gained.
@@ -26,12 +23,12 @@ _ROUNDS, _NEAR, _GAINED = 2, 6.0, 1.0
 _FAR, _MOST = 25.0, 6
 
 
-def weigh_clocks(weigher: "Weigher", combinations: Sequence[Combination]) -> None:
+def weigh_clocks(weigher: Weigher, combinations: Sequence[Combination]) -> None:
     """Weigh combinations, fitted before, where the clock may run ahead and behind beside a coloured error."""
     _search(weigher, combinations, _likeliest(weigher.found))
 
 
-def weigh_later_clocks(weigher: "Weigher", combinations: Sequence[Combination]) -> None:
+def weigh_later_clocks(weigher: Weigher, combinations: Sequence[Combination]) -> None:
     """The same after others were searched for such errors: all beside the likeliest one's, and a few that come near
     there searched themselves."""
     like, found = _likeliest(weigher.found), weigher.found
@@ -43,7 +40,7 @@ def weigh_later_clocks(weigher: "Weigher", combinations: Sequence[Combination]) 
     _search(weigher, combinations, like)
 
 
-def share_clocks(weigher: "Weigher") -> None:
+def share_clocks(weigher: Weigher) -> None:
     """Weigh everything beside the errors of sensor and clock of the likeliest estimate of this kind, where these are
     new; what gains and is near the best is searched again from there."""
     found, base = weigher.found, set(weigher.base)
@@ -70,7 +67,7 @@ def _evidence(found: Found, combination: Combination) -> float:
     return -np.inf if one is None else one.log_evidence
 
 
-def _search(weigher: "Weigher", combinations: Sequence[Combination], like: Estimate | None) -> None:
+def _search(weigher: Weigher, combinations: Sequence[Combination], like: Estimate | None) -> None:
     found = weigher.found
     own = [c for c in combinations if found.of(c, "coloured")]
     colours = [one.colours for c in own if (one := found.of(c, "coloured"))]
@@ -79,7 +76,7 @@ def _search(weigher: "Weigher", combinations: Sequence[Combination], like: Estim
             weigher.add_beside_white(one)
 
 
-def _weigh_beside(weigher: "Weigher", combinations: Sequence[Combination], like: Estimate) -> None:
+def _weigh_beside(weigher: Weigher, combinations: Sequence[Combination], like: Estimate) -> None:
     """Weigh combinations beside the errors that an estimate has."""
     found = weigher.found
     fitted = [c for c in combinations if (white := found.of(c, "white")) and np.isfinite(white.log_evidence)]

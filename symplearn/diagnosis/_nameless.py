@@ -7,6 +7,7 @@ import numpy as np
 from .._effects import UNNAMED, Nameless
 from .._recording import Recording
 from .._simulation_records import SimulationFile
+from ._clocks import weigh_later_clocks
 from ._extended import Extended
 from ._found import Found
 from ._laws import laws, priced
@@ -237,7 +238,7 @@ def _weigh_beside_remainders(search: Search, members: Sequence[int]) -> None:
         return
     kinds = {e.kind for es in found.estimates.values() for e in es}
     if "clock" in kinds:
-        search.weigher.weigh_later_clocks(near)
+        weigh_later_clocks(search.weigher, near)
     if "static" in kinds:
         search.weigher.weigh_static(near)
     search.add_forces(near[:1], 2)

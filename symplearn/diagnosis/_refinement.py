@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._effects import HIDDEN, STOP, Memory, Oscillating
+from ._clocks import share_clocks, weigh_later_clocks
 from ._depths import along_the_depths
 from ._driven import as_driven
 from ._found import Found, speaker
@@ -139,8 +140,8 @@ class Refinement:
         if new := [start for c, start in some.items() if c not in self.found.estimates]:
             self.weigher.weigh(new, whole=True)
         if rest.kind == "clock" and some:
-            self.weigher.weigh_later_clocks(list(some))
-            self.weigher.share_clocks()
+            weigh_later_clocks(self.weigher, list(some))
+            share_clocks(self.weigher)
 
     def _bases(self, ranked: Sequence[Combination]) -> list[Combination]:
         """The best of every size, and the best without an unseen oscillator, which no exchange takes out."""

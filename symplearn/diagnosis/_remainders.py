@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from ._clocks import share_clocks, weigh_clocks
 from ._found import Found
 from ._problem import MOST, Combination
 from ._weigher import KEPT, Weigher
@@ -38,9 +39,9 @@ class Remainders:
             # What a clock excuses may be all that a larger one has ahead of the best of its size.
             first = list(dict.fromkeys([*near, self.weigher.base, *self._of_each_size(_SIMPLE)]))
             before = {c: self.found.odds(c) for c in ranked}
-            self.weigher.weigh_clocks(first)
-            self.weigher.weigh_clocks(self._lifted(first, before, "clock")[:_CLOCKS])
-            self.weigher.share_clocks()
+            weigh_clocks(self.weigher, first)
+            weigh_clocks(self.weigher, self._lifted(first, before, "clock")[:_CLOCKS])
+            share_clocks(self.weigher)
 
     def weigh_static(self) -> None:
         """The best combinations again beside a force that goes with place, which any of their forces may stand for; not

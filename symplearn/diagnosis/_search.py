@@ -8,6 +8,7 @@ import numpy as np
 
 from .._effects import NOISE, OUTLIERS
 from ._calibrate import Priors
+from ._clocks import share_clocks
 from ._effect_priors import with_effects
 from ._found import Found
 from ._motion import extent, motion_along
@@ -199,7 +200,7 @@ class Search:
         """Find the likeliest about their own optima."""
         if self.in_time():
             self.progress("following the likeliest to their own optima")
-            self.weigher.share_clocks()
+            share_clocks(self.weigher)
             settle(self.weigher, self._is_mine)
 
     def goes_on(self, stepper: Stepper, priors: Priors) -> None:

@@ -10,7 +10,6 @@ from .._effects import OUTLIERS, STOP
 from ._along import along, readings
 from ._calibrate import Fits, Priors, grow, residuals, weights
 from ._clock import weigh_known_clock
-from ._clocks import share_clocks, weigh_clocks, weigh_later_clocks
 from ._coloured import Colour
 from ._found import Found
 from ._jitter import weigh_jitter
@@ -167,18 +166,6 @@ class Weigher:
         sensors += weigh_positional(self.problem, fits, priors, self.rows, moving=True)
         for estimate in correlated + sensors + weigh_jitter(self.problem, fits, priors, self.rows):
             self.add_beside_white(estimate)
-
-    def weigh_clocks(self, combinations: Sequence[Combination]) -> None:
-        """Weigh combinations, fitted before, where the clock may run ahead and behind beside a coloured error."""
-        weigh_clocks(self, combinations)
-
-    def weigh_later_clocks(self, combinations: Sequence[Combination]) -> None:
-        """The same after others were, of those alone that come near beside the likeliest one's errors."""
-        weigh_later_clocks(self, combinations)
-
-    def share_clocks(self) -> None:
-        """Weigh all combinations beside the errors of sensor and clock of the likeliest of these estimates."""
-        share_clocks(self)
 
     def weigh_static(self, combinations: Sequence[Combination]) -> None:
         """Weigh combinations, fitted before, beside a small force that goes with place."""
