@@ -80,3 +80,21 @@ def test_what_has_not_come_round_once_was_not_seen_to_swing(problem, effect):
             fit.z[entry] = omega
             named = posterior(problem, found(problem, estimate(problem, (), 0.0), fit), 1.0).named
             assert [w.combination for w in named] == ([combination] if is_weighed else [])
+
+
+def test_what_changes_at_the_very_beginning_was_not_seen_to_change():
+    """A sudden change after the fourth reading of two coordinates, whose start is four numbers, is another value of the
+    parameter; after the sixth it is a change. In one of two recordings it may come at the beginning: the other shows
+    how it was."""
+    more = "[parameters]\nk = { value = 1.0, sd = 0.01 }\n"
+    file = cases.simulation("(p1**2 + p2**2 + k*q1**2 + q2**2)/2", ["q1", "q2"], ["p1", "p2"],
+                            {"a": "q1", "b": "q2"}, more=more)  # fmt: skip
+    one = cases.recorded(np.arange(20.0), np.ones((20, 2)), columns=("a", "b"))
+    for recordings, time, is_weighed in (([one], 1.5, False), ([one], 2.5, True), ([one, one], 1.5, False)):
+        p = cases.problem(file, recordings, 1.0)
+        member = place(p, "regime_change", "k")
+        for some, counts in ((member, is_weighed), *((v, True) for v in p.variants(member))):
+            fit = estimate(p, (some,), 9.0)
+            fit.z[p.slots : p.slots + 2] = 0.1, time
+            named = posterior(p, found(p, estimate(p, (), 0.0), fit), 1.0).named
+            assert bool(named) == counts

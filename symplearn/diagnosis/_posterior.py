@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from .._effects import GAIN, HIDDEN, Memory, Oscillating
+from .._effects import GAIN, HIDDEN, REGIME, Memory, Oscillating
 from ._constant import constant_evidence
 from ._found import Found, speaker
 from ._own_period import in_tune
@@ -194,7 +194,8 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
     An effect that calibration owns already (a stiffness beside a free stiffness) changes nothing, and its
     posterior is its prior; weighing it would only dilute the others. One that would swing, but fits best where it has
     not come round once, at the lowest frequency looked for or below, was not seen to swing: any slow change would do.
-    A scale that makes a reading vanish says nothing of the motion that was to be read. A law without a word whose size
+    What changes before the readings say more than where the motion starts was not seen to change: it is another value
+    of its parameter, which a prior may exclude. A scale that makes a reading vanish says nothing of the motion that was to be read. A law without a word whose size
     may be nothing has its evidence from no optimum: where it goes with a coordinate that is not read, it is as large as
     that coordinate is small.
     """
@@ -213,9 +214,19 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
         known &= shown and not (one.effect is GAIN and abs(1.0 + best.z[place.start]) < _DEAD)
         if one.effect is HIDDEN or isinstance(one.effect, (Oscillating, Memory)):
             known &= bool(best.z[place.stop - 1] > found.priors.lower[one.values.stop - 1])
+        if one.effect is REGIME:
+            known &= _is_seen_before(problem, member, best.z[place.stop - 1])
         if isinstance(one.effect, Memory):  # what fades at once is a loss that has a name
             known &= bool(best.z[place.stop - 1] < found.priors.upper[one.values.stop - 1])
     return bool(np.isfinite(best.log_evidence) and known)
+
+
+def _is_seen_before(problem: Problem, member: int, time: float) -> bool:
+    """Whether more is read before a time than the numbers of a start, in any of the recordings that an effect is in, or
+    the others, which it is not in, show how it was."""
+    which = problem.members[member].recordings
+    seen = [int((~np.isnan(problem.rows[r].readings[problem.rows[r].times < time])).sum()) for r in which]
+    return len(which) < len(problem.rows) or max(seen) > 2 * problem.equations.declared
 
 
 def _moved(best: Estimate, amplitudes: slice) -> bool:
