@@ -195,9 +195,9 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
     posterior is its prior; weighing it would only dilute the others. One that would swing, but fits best where it has
     not come round once, at the lowest frequency looked for or below, was not seen to swing: any slow change would do.
     What changes before the readings say more than where the motion starts was not seen to change: it is another value
-    of its parameter, which a prior may exclude. A scale that makes a reading vanish says nothing of the motion that was to be read. A law without a word whose size
-    may be nothing has its evidence from no optimum: where it goes with a coordinate that is not read, it is as large as
-    that coordinate is small.
+    of its parameter, which a prior may exclude. A scale that makes a reading vanish says nothing of the motion that was
+    to be read. A law without a word whose size may be nothing has its evidence from no optimum: where it goes with a
+    coordinate that is not read, it is as large as that coordinate is small.
     """
     best = max(found.estimates[combination], key=lambda e: e.log_evidence)
     sd = np.sqrt(np.diag(best.covariance))
