@@ -105,7 +105,7 @@ def test_a_forecast_goes_on_with_the_attraction_that_its_end_belongs_to():
 
 def test_held_out_density_knows_that_the_stiffness_is_uncertain(learnt):
     """The log density of the held-out readings is that of SciPy's predictive Gaussians from the fitted rows, also where
-    the stiffness is said to be ten times as uncertain: then it is 17 nats below that of a stiffness that is known."""
+    start and stiffness are said to be ten times as uncertain: then it is 23 nats below that of what is known."""
     stepper, estimate, *_ = learnt
     y = stepper.problem.rows[0].readings[:, 0]
     fitted = stepper.problem.rows[0].fitted
@@ -113,25 +113,18 @@ def test_held_out_density_knows_that_the_stiffness_is_uncertain(learnt):
     late = TIMES[fitted:]
     steps = np.linalg.cholesky(covariance).T
     slopes = np.stack([swing(mean + step, late) - swing(mean, late) for step in steps])
-    spread = np.sqrt((slopes**2).sum(0) + NOISE**2)
-    expected = norm.logpdf(y[fitted:], swing(mean, late), spread).sum()
     outlook = Outlook(stepper, estimate, 0, np.zeros(1))
-    # Start and stiffness together are a third of the noise at most, so that a spread which lacks the half of the
-    # start's that the filter takes off, having the rows twice, is within two nats over 50 rows.
-    assert outlook.held_out(1.0).log_density == pytest.approx(expected, abs=2.0)
-    variance = outlook._unsure(16.0)[:, 0]
-    at = np.argmax(np.abs(slopes).sum(0))
-    # All of them together have the start's own share, too, which is in the filter's spread here: less than a half.
-    assert variance[at] == pytest.approx(16 * (slopes[:, at] ** 2).sum(), rel=0.5)
-    share = swing(mean + covariance[:, 2] / np.sqrt(covariance[2, 2]), late) - swing(mean, late)
-    # The stiffness alone, the start following it: what its curvature makes of four standard deviations is below 2 %.
-    assert variance[at] == pytest.approx(16 * share[at] ** 2, rel=0.02)
-    known, uncertain = (
-        norm.logpdf(y[fitted:], swing(mean, late), np.sqrt(NOISE**2 + k * share**2)).sum() for k in (0, 100)
-    )
-    # The start's own share of a tenth of the noise's variance, which SciPy's leaves out here, is worth a tenth of a
-    # nat.
-    assert outlook.held_out(100.0).log_density == pytest.approx(uncertain, abs=0.5) and known > uncertain + 15
+
+    def expected(inflation):
+        spread = np.sqrt(inflation * (slopes**2).sum(0) + NOISE**2)
+        return norm.logpdf(y[fitted:], swing(mean, late), spread).sum()
+
+    # Curvature over one and over ten standard deviations; 0.001 and 0.06 were seen.
+    assert outlook.held_out(1.0).log_density == pytest.approx(expected(1.0), abs=0.01)
+    assert outlook.held_out(100.0).log_density == pytest.approx(expected(100.0), abs=0.2)
+    assert expected(0.0) > expected(100.0) + 20
+    # Each row's variance, four standard deviations off: curvature is below 4 % of it.
+    np.testing.assert_allclose(outlook._unsure(16.0)[:, 0], 16 * (slopes**2).sum(0), rtol=0.06)
 
 
 def test_an_outlier_among_them_moves_little():

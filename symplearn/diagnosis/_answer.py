@@ -252,7 +252,7 @@ class Answer:
     def _there(self) -> np.ndarray:
         """The force that the simulation has on every coordinate along the motion."""
         o = self.lens[0]
-        return along(self.problem, force, o.recording, o.estimate.z, (), np.asarray(o.smoothed.means[: o.rows.fitted]))
+        return along(self.problem, force, o.recording, o.estimate.z, (), o.states)
 
     def _rivals(self, member: int) -> list[str]:
         """Effects that could stand in this one's place: in a likely combination that lacks it."""
@@ -337,8 +337,7 @@ class Answer:
         )
 
     def _energy(self, outlook: Outlook) -> np.ndarray:
-        means = np.asarray(outlook.smoothed.means[: outlook.rows.fitted])
-        return outlook.along(energy, means)
+        return outlook.along(energy, outlook.states)
 
     @cached_property
     def forecast(self) -> Forecast | None:

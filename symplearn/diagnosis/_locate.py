@@ -46,9 +46,8 @@ def explained(outlook: Outlook, coordinate: int) -> Explained:
 
 def motion(outlook: Outlook) -> tuple[np.ndarray, np.ndarray]:
     """Smoothed positions and velocities over the fitted rows, each (time, coordinate)."""
-    n = outlook.rows.fitted
-    q = np.asarray(outlook.smoothed.means[:n, : outlook.stepper.problem.equations.dim])
-    return q, np.gradient(q, outlook.rows.times[:n], axis=0)
+    q = outlook.states[:, : outlook.stepper.problem.equations.dim]
+    return q, np.gradient(q, outlook.rows.times[: outlook.rows.fitted], axis=0)
 
 
 def _left(values: np.ndarray, columns: np.ndarray) -> float:

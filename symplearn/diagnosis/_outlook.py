@@ -39,16 +39,21 @@ def _lower_root(covariance: np.ndarray) -> np.ndarray:
     return out
 
 
-def one_off(problem: Problem, e: Estimate, recording: int, inflation: float) -> list[Float[np.ndarray, " z"]]:
-    """The unknowns with one after the other of those that are no phase point off by its standard deviation."""
-    local, state = problem.local(recording), problem.state
-    own = np.concatenate([local[state:], local[:state]])
-    root = _lower_root(e.covariance[np.ix_(own, own)] * inflation)
-    out, c = [], problem.calibrated
-    lowest = problem.lower_bounds(e.combination)
-    for k in np.nonzero(np.diag(root)[: len(local) - state])[0]:
+def one_off(
+    problem: Problem, e: Estimate, recording: int, inflation: float, start: Float[np.ndarray, "local local"] | None
+) -> list[Float[np.ndarray, " z"]]:
+    """The unknowns with one after the other of those that are no phase point off by its standard deviation; then, with
+    the covariance `start` of everything local, those of the phase point that are left when the others are known."""
+    local, state, c = problem.local(recording), problem.state, problem.calibrated
+    order = np.r_[state : len(local), :state]
+    columns = _lower_root(e.covariance[np.ix_(local[order], local[order])] * inflation)[:, : len(local) - state]
+    if start is not None:
+        left = _lower_root(start[np.ix_(order, order)] * inflation)[:, len(local) - state :]
+        columns = np.concatenate([columns, left], axis=1)
+    out, lowest = [], problem.lower_bounds(e.combination)
+    for column in columns.T[columns.any(0)]:
         z = e.z.copy()
-        z[own] += root[:, k]
+        z[local[order]] += column
         z[problem.head : problem.slots] = np.clip(z[problem.head : problem.slots], c.lower, c.upper)
         for entry, low in lowest.items():
             z[entry] = max(z[entry], low)
@@ -77,7 +82,11 @@ class HeldOut:
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """An estimate on one recording. Times, readings and predictions are by row after thinning."""
+    """An estimate on one recording. Times, readings and predictions are by row after thinning.
+
+    Where no force disturbs the motion, it is the fitted trajectory. A filter's sigma points, as far apart as the start
+    is uncertain, may lose that: about an eccentric orbit one was seen to end four hundred times too far out.
+    """
 
     stepper: Stepper
     estimate: Estimate
@@ -110,12 +119,24 @@ class Outlook:
         return self.rows.readings - np.nan_to_num(bent(expected, self.rows.times, self.estimate.bends) - expected)
 
     @cached_property
-    def _start_spread(self) -> Float[np.ndarray, "state state"]:
-        """Posterior covariance of the phase point at the first row, as far as the Gaussian holds."""
+    def _within_reach(self) -> Float[np.ndarray, "local local"]:
+        """Posterior covariance of all that the recording depends on, as far as the Gaussian holds for its start."""
         if self.near is not None:
-            return self.near._start_spread
-        state = self.stepper.problem.state
-        return covariance_within_reach(self.stepper, self.estimate, self.recording)[:state, :state]
+            return self.near._within_reach
+        return covariance_within_reach(self.stepper, self.estimate, self.recording)
+
+    @property
+    def _start_spread(self) -> Float[np.ndarray, "state state"]:
+        return self._within_reach[: self.stepper.problem.state, : self.stepper.problem.state]
+
+    @property
+    def _is_free(self) -> bool:
+        """Whether no force disturbs the motion."""
+        return not self.intensity.any()
+
+    @cached_property
+    def _trajectory(self) -> tuple[Float[np.ndarray, "time channel"], Float[np.ndarray, "time state"]]:
+        return self._run(self._begin, 0)
 
     @property
     def _begin(self) -> Float[np.ndarray, " state"]:
@@ -125,7 +146,9 @@ class Outlook:
 
     @property
     def ok(self) -> bool:
-        """Whether the filter went through."""
+        """Whether the filter, or the trajectory, went through the fitted rows."""
+        if self._is_free:
+            return bool(np.isfinite(self._trajectory[1][: self.rows.fitted]).all())
         return bool(self._filtered[1].ok)
 
     @cached_property
@@ -136,11 +159,18 @@ class Outlook:
 
     @cached_property
     def last_state(self) -> Float[np.ndarray, " state"]:
-        """The phase point filtered at the last fitted row; the trajectory's own where the filter failed."""
+        """The phase point filtered at the last fitted row; the trajectory's own where nothing disturbs it, or where the
+        filter failed."""
         last = self.rows.fitted - 1
-        if self.ok:
+        if self.ok and not self._is_free:
             return np.asarray(self._filtered[1].filtered_means[last])
-        return self._run(self._begin, 0)[1][last]
+        return self._trajectory[1][last]
+
+    @cached_property
+    def states(self) -> Float[np.ndarray, "fitted state"]:
+        """Phase points over the fitted rows, given all of these."""
+        states = self._trajectory[1] if self._is_free else self.smoothed.means
+        return np.asarray(states[: self.rows.fitted])
 
     @cached_property
     def readings(self) -> Float[np.ndarray, "time channel"]:
@@ -157,8 +187,11 @@ class Outlook:
     @cached_property
     def followed(self) -> Float[np.ndarray, "fitted channel"]:
         """Readings of the filtered phase points over the fitted rows."""
-        means = np.asarray(self._filtered[1].filtered_means[: self.rows.fitted])
-        return bent(self.along(readings, means), self.rows.times[: self.rows.fitted], self.estimate.bends)
+        if self._is_free:
+            shown = self._trajectory[0][: self.rows.fitted]
+        else:
+            shown = self.along(readings, np.asarray(self._filtered[1].filtered_means[: self.rows.fitted]))
+        return bent(shown, self.rows.times[: self.rows.fitted], self.estimate.bends)
 
     def along(self, what: What, states: Float[np.ndarray, "row state"]) -> np.ndarray:
         """Something that the augmented simulation has at phase points of the leading rows."""
@@ -167,7 +200,9 @@ class Outlook:
 
     @cached_property
     def innovations(self) -> Float[np.ndarray, "fitted channel"]:
-        """Standardised innovations of the fitted rows."""
+        """Standardised innovations of the fitted rows, of a trajectory its errors by the noise."""
+        if self._is_free:
+            return (self.rows.readings - self.readings)[: self.rows.fitted] / self._noise[: self.rows.fitted]
         return np.asarray(self._filtered[1].standardised_innovations[: self.rows.fitted])
 
     def held_out_errors(self, times: np.ndarray, readings: np.ndarray) -> Float[np.ndarray, "row channel"]:
@@ -188,19 +223,30 @@ class Outlook:
         """How held-out rows lie around the free run, with the spread of the filter and of the unknowns; `inflation`
         multiplies their posterior covariance."""
         first = self.rows.fitted
-        weight = self._roots()[first:] ** 2
-        S = np.asarray(self._filtered[1].innovation_covariances[first : len(self.rows.times)])
-        variance = np.diagonal(S, axis1=1, axis2=2) / weight + self._unsure(inflation)
-        return HeldOut(self.rows.readings[first:] - self.readings[first:], variance)
+        return HeldOut((self.rows.readings - self.readings)[first:], self._scatter[first:] + self._unsure(inflation))
+
+    @cached_property
+    def _scatter(self) -> Float[np.ndarray, "time channel"]:
+        """Variance of every reading when the unknowns are known: of the noise, and of what the filter cannot tell."""
+        if self._is_free:
+            return self._noise**2
+        S = np.asarray(self._filtered[1].innovation_covariances[: len(self.rows.times)])
+        return np.diagonal(S, axis1=1, axis2=2) / self._roots() ** 2
 
     def _unsure(self, inflation: float) -> Float[np.ndarray, "held channel"]:
         """Variance of the held-out free run that unknown parameters leave: each of them off by one standard deviation
-        in turn, those before it being known and the start following. What diverges then says nothing."""
-        variance = np.zeros_like(self.run)
-        for z in one_off(self.stepper.problem, self.estimate, self.recording, inflation):
+        in turn, those before it being known and the start following; and, of a trajectory, what is left of the start.
+        What diverges then says nothing."""
+        variance, start = np.zeros_like(self.run), self._within_reach if self._is_free else None
+        for z in one_off(self.stepper.problem, self.estimate, self.recording, inflation, start):
             other = replace(self, estimate=replace(self.estimate, z=z), near=self)
             variance += np.nan_to_num((other.run - self.run) ** 2, posinf=0.0)
         return variance[1:]
+
+    @property
+    def _noise(self) -> Float[np.ndarray, "time channel"]:
+        """Standard deviation of the reading error in every row."""
+        return total_noise(self.estimate) / self._roots()
 
     def _roots(self) -> np.ndarray:
         return row_roots(self.stepper.problem, self.recording, len(self.rows.times), colour_ratio(self.estimate))
@@ -208,6 +254,8 @@ class Outlook:
     def missing_force(self) -> Float[np.ndarray, "fitted coordinate"]:
         """Smoothed missing force on every momentum, in units of dp/dt, by fitted row (the last span's twice)."""
         n = self.rows.fitted
+        if self._is_free:
+            return np.zeros((n, self.stepper.problem.equations.dim))
         xi = np.asarray(self.smoothed.disturbances[: n - 1, self.stepper.problem.equations.momentum])
         force = xi / np.diff(self.rows.times[:n])[:, None]
         return np.concatenate([force, force[-1:]])
@@ -215,6 +263,8 @@ class Outlook:
     def strain(self) -> Float[np.ndarray, "fitted coordinate"]:
         """Standardised smoothed disturbances of every momentum."""
         n = self.rows.fitted
+        if self._is_free:
+            return np.zeros((n, self.stepper.problem.equations.dim))
         series = np.asarray(self.smoothed.standardised_disturbances[: n - 1, self.stepper.problem.equations.momentum])
         return np.concatenate([series, series[-1:]])
 

@@ -218,7 +218,7 @@ def _rounded(value: float, digits: int) -> float:
 
 def _turning(o: Outlook, points: Float[np.ndarray, "row two_d"]) -> Bool[np.ndarray, " d"]:
     """Which coordinates go round, a whole turn of which changes no force."""
-    means, d = np.asarray(o.smoothed.means[: o.rows.fitted]), points.shape[1] // 2
+    means, d = o.states, points.shape[1] // 2
     out = np.ptp(points[:, :d], axis=0) >= 2 * np.pi
     for i in np.flatnonzero(out):
         turned = means + 2 * np.pi * (np.arange(means.shape[1]) == i)

@@ -92,12 +92,8 @@ def along_outlooks(
 
 def points(file: SimulationFile, o: Outlook) -> Float[np.ndarray, "row two_d"]:
     """The smoothed phase points of the file's own coordinates."""
-    means, d, width = (
-        np.asarray(o.smoothed.means[: o.rows.fitted]),
-        len(file.coordinates),
-        o.stepper.problem.equations.width,
-    )
-    return np.concatenate([means[:, :d], means[:, width : width + d]], axis=1)
+    d, width = len(file.coordinates), o.stepper.problem.equations.width
+    return np.concatenate([o.states[:, :d], o.states[:, width : width + d]], axis=1)
 
 
 def along_path(
