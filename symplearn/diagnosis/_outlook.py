@@ -14,6 +14,7 @@ from .._smoother import Smoothed
 from ._along import What, along, readings
 from ._bend import bent
 from ._lasting import colour_ratio, total_noise
+from ._path_filter import filter_along, prolonged
 from ._problem import Problem
 from ._reach import covariance_within_reach
 from ._stochastic import free_run, row_roots, run_filter, run_smoother
@@ -24,9 +25,21 @@ from ._weighed import Estimate
 _SPENT = 1e-14
 
 
+# A filter whose innovations are on average so many times as large as it expects, squared, has lost the motion.
+_LOST = 25.0
+
+
 def intensity_of(stepper: Stepper, estimate: Estimate) -> Float[np.ndarray, " d"]:
     """Intensity of the missing force, zero where the remainder is not one."""
     return np.zeros(stepper.problem.equations.dim) if estimate.intensity is None else estimate.intensity
+
+
+@np.errstate(invalid="ignore", over="ignore")
+def _strain(filtered: Filtered) -> float:
+    """Mean square of the standardised innovations; infinite where the filter failed."""
+    squares = np.asarray(filtered.standardised_innovations)[np.asarray(filtered.observed)] ** 2
+    value = float(squares.mean()) if len(squares) else 0.0
+    return value if bool(filtered.ok) and np.isfinite(value) else np.inf
 
 
 def _lower_root(covariance: np.ndarray) -> np.ndarray:
@@ -101,6 +114,29 @@ class Outlook:
 
     @cached_property
     def _filtered(self) -> tuple[Any, Filtered]:
+        """What the filter was given and what it says; about the most probable path where sigma points lost it."""
+        given, filtered = self._by_sigma_points
+        followed = filtered if self._along_its_path is None else self._along_its_path[0]
+        return given, followed
+
+    @cached_property
+    def _along_its_path(self) -> tuple[Filtered, Smoothed] | None:
+        """Filtered and smoothed about the estimate's own path, where that follows the readings and sigma points do
+        not."""
+        given, filtered = self._by_sigma_points
+        if _strain(filtered) < _LOST:
+            return None
+        e, r = self.estimate, self.recording
+        path = self._trajectory[1][: self.rows.fitted] if e.paths is None else e.paths[r]
+        whole = prolonged(self.stepper, r, e.z, e.combination, path)
+        if not np.isfinite(whole).all():
+            return None
+        found = filter_along(self.stepper, r, e.z, e.combination, whole, given, self._start_spread,
+                             self._straight[: self.rows.fitted])  # fmt: skip
+        return found if _strain(found[0]) < _strain(filtered) else None
+
+    @cached_property
+    def _by_sigma_points(self) -> tuple[Any, Filtered]:
         e, r = self.estimate, self.recording
         given, filtered = run_filter(
             self.stepper.problem, self.stepper.courses[r], r, e.z, e.combination, total_noise(e), colour_ratio(e),
@@ -155,6 +191,8 @@ class Outlook:
     def smoothed(self) -> Smoothed:
         """State and noises given all fitted rows."""
         e = self.estimate
+        if self._along_its_path is not None:
+            return self._along_its_path[1]
         return run_smoother(self.stepper, self.recording, e.z, e.combination, *self._filtered)
 
     @cached_property
