@@ -13,17 +13,13 @@ from .._filter import Filtered
 from .._smoother import Smoothed
 from ._along import What, along, readings
 from ._bend import bent
+from ._held_out import HeldOut, one_off
 from ._lasting import colour_ratio, total_noise
 from ._path_filter import filter_along, prolonged
-from ._problem import Problem
 from ._reach import covariance_within_reach
 from ._stochastic import free_run, row_roots, run_filter, run_smoother
 from ._trajectory import Stepper
 from ._weighed import Estimate
-
-# A pivot of this part of its variance is round-off.
-_SPENT = 1e-14
-
 
 # A filter whose innovations are on average so many times as large as it expects, squared, has lost the motion.
 _LOST = 25.0
@@ -40,57 +36,6 @@ def _strain(filtered: Filtered) -> float:
     squares = np.asarray(filtered.standardised_innovations)[np.asarray(filtered.observed)] ** 2
     value = float(squares.mean()) if len(squares) else 0.0
     return value if bool(filtered.ok) and np.isfinite(value) else np.inf
-
-
-def _lower_root(covariance: np.ndarray) -> np.ndarray:
-    """The lower triangular L with L L' = covariance; a column of zeros where nothing is left of a variance."""
-    rest, out = covariance.copy(), np.zeros_like(covariance)
-    for k, variance in enumerate(np.diag(covariance)):
-        if rest[k, k] > _SPENT * variance:
-            out[k:, k] = rest[k:, k] / np.sqrt(rest[k, k])
-            rest -= np.outer(out[:, k], out[:, k])
-    return out
-
-
-def one_off(
-    problem: Problem, e: Estimate, recording: int, inflation: float, start: Float[np.ndarray, "local local"] | None
-) -> list[Float[np.ndarray, " z"]]:
-    """The unknowns with one after the other of those that are no phase point off by its standard deviation; then, with
-    the covariance `start` of everything local, those of the phase point that are left when the others are known."""
-    local, state, c = problem.local(recording), problem.state, problem.calibrated
-    order = np.r_[state : len(local), :state]
-    columns = _lower_root(e.covariance[np.ix_(local[order], local[order])] * inflation)[:, : len(local) - state]
-    if start is not None:
-        left = _lower_root(start[np.ix_(order, order)] * inflation)[:, len(local) - state :]
-        columns = np.concatenate([columns, left], axis=1)
-    out, lowest = [], problem.lower_bounds(e.combination)
-    for column in columns.T[columns.any(0)]:
-        z = e.z.copy()
-        z[local[order]] += column
-        z[problem.head : problem.slots] = np.clip(z[problem.head : problem.slots], c.lower, c.upper)
-        for entry, low in lowest.items():
-            z[entry] = max(z[entry], low)
-        out.append(z)
-    return out
-
-
-@dataclass(frozen=True, eq=False)
-class HeldOut:
-    """Readings of held-out rows less the free run, NaN where nothing was read, and the variances expected of them."""
-
-    errors: Float[np.ndarray, "held channel"]
-    variances: Float[np.ndarray, "held channel"]
-
-    @property
-    def log_density(self) -> float:
-        """Sum of the log densities of all readings."""
-        terms = -0.5 * (np.log(2 * np.pi * self.variances) + self.errors**2 / self.variances)
-        return float(terms[~np.isnan(self.errors)].sum())
-
-    @property
-    def squares(self) -> Float[np.ndarray, "held channel"]:
-        """Squared errors by what is expected of them."""
-        return self.errors**2 / self.variances
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,9 +183,11 @@ class Outlook:
 
     @cached_property
     def innovations(self) -> Float[np.ndarray, "fitted channel"]:
-        """Standardised innovations of the fitted rows, of a trajectory its errors by the noise."""
+        """Standardised innovations of the fitted rows, of a trajectory its errors by the noise; 0 where nothing was
+        read."""
         if self._is_free:
-            return (self.rows.readings - self.readings)[: self.rows.fitted] / self._noise[: self.rows.fitted]
+            errors = (self.rows.readings - self.readings) / self._noise
+            return np.where(np.isnan(self.rows.readings), 0.0, errors)[: self.rows.fitted]
         return np.asarray(self._filtered[1].standardised_innovations[: self.rows.fitted])
 
     def held_out_errors(self, times: np.ndarray, readings: np.ndarray) -> Float[np.ndarray, "row channel"]:
@@ -248,16 +195,12 @@ class Outlook:
         run = self.readings[self.rows.fitted - 1 :]
         if not np.isfinite(run).all():
             return np.full_like(readings, np.nan)
-        return (
-            readings - CubicSpline(self.rows.times[self.rows.fitted - 1 :], run)(times)
-            if len(run) > 3
-            else (
-                readings
-                - np.stack([np.interp(times, self.rows.times[self.rows.fitted - 1 :], c) for c in run.T], axis=1)
-            )
-        )
+        path = self.rows.times[self.rows.fitted - 1 :]
+        if len(run) > 3:
+            return readings - CubicSpline(path, run)(times)
+        return readings - np.stack([np.interp(times, path, column) for column in run.T], axis=1)
 
-    def held_out(self, inflation: float) -> "HeldOut":
+    def held_out(self, inflation: float) -> HeldOut:
         """How held-out rows lie around the free run, with the spread of the filter and of the unknowns; `inflation`
         multiplies their posterior covariance."""
         first = self.rows.fitted
