@@ -23,9 +23,9 @@ def damped_spring():
     rows = [r.fitted for r in p.rows]
     seeds = first_fits(stepper, priors_without_effects(p), rows)
     search = Search(stepper, seeds.z, np.inf, lambda message: None)
-    search._begin()
+    search.beginning.run()
     (damping,) = (m for m in p.searched if p.candidate(m).effect.name == "viscous_damping")
-    search.weigher.weigh([Start((damping,), search.seed, 0.0)], whole=True)
+    search.weigher.weigh([Start((damping,), search.beginning.seed, 0.0)], whole=True)
     return search, damping
 
 

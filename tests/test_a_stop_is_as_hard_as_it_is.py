@@ -28,7 +28,7 @@ def search():
     p = stepper.problem
     seeds = first_fits(stepper, priors_without_effects(p), [r.fitted for r in p.rows])
     found = Search(stepper, seeds.z, np.inf, lambda message: None)
-    found._begin()
+    found.beginning.run()
     return found
 
 
@@ -43,7 +43,7 @@ def began(search, k, a):
     """The recorded motion with a stop."""
     stop = (upper_stop(search),)
     ((_, place),) = search.problem.placed(stop)
-    z = search.seed.copy()
+    z = search.beginning.seed.copy()
     z[:3:2], z[place] = (0.0, 1.0), (k, a)
     return Start(stop, z, 0.0)
 

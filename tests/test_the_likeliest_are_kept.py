@@ -37,8 +37,8 @@ def member(search, name):
 def damped():
     """A damped spring of which nothing and the damping were weighed."""
     search = searched(lambda t, x: [x[1], -x[0] - 0.01 * x[1]], [1.0, 0.0], "p**2/2 + q**2/2", 0.01)
-    search._begin()
-    search.weigher.weigh([Start((member(search, "viscous_damping"),), search.seed, 0.0)], whole=True)
+    search.beginning.run()
+    search.weigher.weigh([Start((member(search, "viscous_damping"),), search.beginning.seed, 0.0)], whole=True)
     return search
 
 
@@ -103,12 +103,12 @@ def test_what_stopped_at_another_time_begins_where_its_part_did():
     p = stepper.problem
     seeds = first_fits(stepper, priors_without_effects(p), [r.fitted for r in p.rows])
     search = Search(stepper, seeds.z, np.inf, lambda message: None)
-    search._begin()
+    search.beginning.run()
     blow, stiffness = member(search, "impulse"), member(search, "quadratic_stiffness")
     pair = tuple(sorted((blow, stiffness)))
 
     def begun(combination, time):
-        z, where = search.from_seed(), dict(p.placed(combination))
+        z, where = search.beginning.from_seed(), dict(p.placed(combination))
         z[where[blow]] = 0.1, time
         return Start(combination, z, 0.0)
 
@@ -126,8 +126,8 @@ def test_a_path_that_was_thrown_out_sets_no_scale():
     trajectory; one that has settled is not."""
     search = searched(lambda t, x: [x[1], -x[0]], [1.0, 0.0], "p**2/2 + q**2/2", 0.01)
     far = [np.stack([1e3 * np.sin(TIMES), np.zeros_like(TIMES), 1e3 * np.cos(TIMES), np.zeros_like(TIMES)], axis=1)]
-    search.null_paths = [PathFit((), np.ones(1), search.seed, np.full(1, 0.01), far)]
-    _, paths = search._likely_paths()
+    search.beginning.paths = [PathFit((), np.ones(1), search.beginning.seed, np.full(1, 0.01), far)]
+    _, paths = search.beginning._likely_paths()
     assert np.abs(paths[0]).max() < 2
-    search.null_paths = [replace(search.null_paths[0], converged=True)]
-    assert search._likely_paths()[1] is far
+    search.beginning.paths = [replace(search.beginning.paths[0], converged=True)]
+    assert search.beginning._likely_paths()[1] is far

@@ -58,9 +58,9 @@ class Extended:
             for force in forces:
                 if force.memory is not None:
                     (i,) = force.places
-                    out.append(np.array([STRENGTH * stiffness(self.search.typical[i], self._along(i))]))
+                    out.append(np.array([STRENGTH * stiffness(self.search.beginning.typical[i], self._along(i))]))
                     continue
-                each = [[self.search.typical[i] / next(sizes) for _ in terms]
+                each = [[self.search.beginning.typical[i] / next(sizes) for _ in terms]
                         for i, terms in zip(force.places, force.pushes, strict=True)]  # fmt: skip
                 out.append(STRENGTH * np.min(each, axis=0))
         return out
@@ -73,13 +73,13 @@ class Extended:
 
     def _along(self, i: int) -> list[Float[np.ndarray, " row"]]:
         """A coordinate along the motion that every prior of an effect comes from, by recording."""
-        return [path[:, i] for path in self.search.likely[1]]
+        return [path[:, i] for path in self.search.beginning.likely[1]]
 
     def _sizes(self, terms: Sequence[sympy.Expr]) -> Float[np.ndarray, " term"]:
         """Root mean squares of terms along the motion that every prior of an effect comes from."""
         if not terms:
             return np.zeros(0)
-        problem, (z, paths), columns = self.search.problem, self.search.likely, []
+        problem, (z, paths), columns = self.search.problem, self.search.beginning.likely, []
         d, width = len(self.file.coordinates), problem.equations.width
         for r, (path, rows) in enumerate(zip(paths, problem.rows, strict=True)):
             points = np.concatenate([path[:, :d], path[:, width : width + d]], axis=1)

@@ -86,7 +86,7 @@ def _weigh_laws(search: Search, members: Sequence[int]) -> None:
     starts = _promising(search, members)
     alone = [s.combination for s in starts if len(s.combination) == len(search.base) + 1]
     if alone and not near:  # a regression about what is far off says little of where a fit begins
-        search.weigher.weigh([Start(c, search.from_seed(), 0.0) for c in alone])
+        search.weigher.weigh([Start(c, search.beginning.from_seed(), 0.0) for c in alone])
     if starts:
         search.weigher.weigh(starts, whole=True)
     if _is_open(_odds(search), found):  # what was found may hide what a law does alone
@@ -247,7 +247,7 @@ def _weigh_beside_remainders(search: Search, members: Sequence[int]) -> None:
 def _weigh_proposals(search: Search, begun: Extended, listed: Sequence[Proposal]) -> None:
     """All expressions together, alone and beside a missing force."""
     members = begun.members(len(listed))
-    combination, z = tuple(sorted((*search.base, *members))), search.from_seed()
+    combination, z = tuple(sorted((*search.base, *members))), search.beginning.from_seed()
     sizes = {m: one.sizes for m, one in zip(members, listed, strict=True)}
     for member, place in search.problem.placed(combination):
         if member in sizes:

@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from .._effects import NOISE, OUTLIERS
+from ._beginning import STARTS, Beginning
 from ._calibrate import Priors
 from ._clocks import share_clocks
-from ._effect_priors import with_effects
 from ._found import Found
-from ._motion import extent, motion_along
-from ._noisy import PathFit, fit_paths
-from ._null_paths import beside, null_paths
+from ._noisy import fit_paths
+from ._null_paths import beside
 from ._problem import MOST, Combination, Problem
 from ._prospects import MANY, Prospects, promising
 from ._refinement import Refinement
@@ -21,8 +20,7 @@ from ._remainders import Remainders
 from ._score import Start
 from ._settle import settle
 from ._spells import Spells
-from ._start import priors_without_effects, with_states
-from ._stochastic import trajectories
+from ._start import priors_without_effects
 from ._trajectory import Stepper
 from ._weigher import KEPT, Weigher
 
@@ -33,8 +31,6 @@ _REACH = 30.0
 _BASES, _PAIRS, _WORTH = 4, 32, 2.0
 # How many effects are fitted where they are small, and how often the same at other places or in other recordings.
 _SMALL, _ALIKE = 24, 4
-# From how many seeds, and how many paths under a missing force, the simulation as it is is fitted.
-_STARTS = 4
 # Combinations that a missing force is tried beside.
 _FORCED = 6
 # Combinations that are fitted between two looks at the clock.
@@ -54,12 +50,9 @@ class Search:
         spared: frozenset[int] = frozenset(),
     ):  # fmt: skip
         self.weigher = Weigher(stepper, Found(stepper.problem, priors_without_effects(stepper.problem)))
-        self.seeds, self.seed, self.rows = seeds, seeds[0], self.weigher.rows
-        self.deadline, self.progress, self.spared = (
-            deadline,
-            progress,
-            spared,
-        )  # columns that no reading is taken out of
+        self.rows = self.weigher.rows
+        self.deadline, self.progress = deadline, progress
+        self.beginning = Beginning(self.weigher, seeds, progress, spared)
         self.prospects = Prospects(self.weigher)
         self.refinement = Refinement(self.prospects, progress)
         self.remainders = Remainders(self.weigher, progress)
@@ -82,7 +75,7 @@ class Search:
 
     def run(self) -> Found:
         """Search, smallest combinations first."""
-        self._begin()
+        self.beginning.run()
         for size in range(1, MOST - len(self.base) + 1):
             if size > 1 and not self.in_time():
                 break
@@ -107,71 +100,9 @@ class Search:
         self._weigh_with_outliers_in()
         return self.found
 
-    def _begin(self) -> None:
-        """The simulation without effects, under every remainder; and what every effect's prior is, from its motion."""
-        bare, w = self.found.priors, self.weigher
-        self._follow(bare)
-        # From trajectories, too: a path that needs a strong force to follow the recording goes through outliers.
-        if w.take_out_outliers(self.null_paths, w.found.priors, self.spared):
-            w.found = Found(self.problem, bare)
-            self._follow(bare)
-        w.add_paths(self.null_paths)
-
-    def _follow(self, bare: Priors) -> None:
-        """Paths and trajectories of the simulation as it is, and the priors of effects that its motion sets."""
-        w = self.weigher
-        self.progress("following the recording with a missing force")
-        paths = null_paths(w.stepper, self.seed, self.rows, bare, w.path_steps)
-        self.null_paths = [replace(fit, combination=self.base) for fit in paths]
-        self.likely = z, likely = self._likely_paths()
-        motion = motion_along(self.problem, z, likely)
-        self.typical = motion.forces
-        w.found.priors = with_effects(self.problem, with_states(self.problem, bare, likely), motion)
-        self.progress("weighing the simulation as it is")
-        self._weigh_nothing()
-        self.null_paths = self._paths_again()
-
-    def _paths_again(self) -> list[PathFit]:
-        """Paths under the priors of effects; for each intensity the better of two, from the path it had and from the
-        trajectory: a weak force is hard to reach from a path that no force could have."""
-        w, white, paths = self.weigher, self.found.of(self.base, "white"), self.null_paths
-        again = fit_paths(w.stepper, paths, w.found.priors, self.rows, 3)
-        if white is None or not white.converged:
-            return again
-        states = trajectories(w.stepper, white.z, self.base, self.rows)
-        starts = [replace(fit, z=white.z, noise=white.noise, paths=states, laplace=None) for fit in paths]
-        near = fit_paths(w.stepper, starts, w.found.priors, self.rows, w.path_steps)
-        return [max(pair, key=lambda fit: fit.log_evidence) for pair in zip(again, near, strict=True)]
-
-    def _likely_paths(self) -> tuple[np.ndarray, list[np.ndarray]]:
-        """A motion like the recorded one, with its unknowns: the best path; where that has not settled, the smaller of
-        it and of the best trajectory: near a singularity a missing force throws a path far out."""
-        best = self._null
-        ways = [(best.z, best.paths)]
-        if not best.converged:
-            ways.append((self.seeds[0], trajectories(self.stepper, self.seeds[0], self.base, self.rows)))
-        some = [way for way in ways if all(np.isfinite(path).all() for path in way[1])]
-        return min(some or ways[:1], key=lambda way: extent(way[1]))
-
-    def _weigh_nothing(self) -> None:
-        """The simulation as it is, from many starts: a local optimum here would look like physics left out."""
-        ways = [fit.z for fit in self.null_paths if np.isfinite(fit.log_evidence)]
-        starts = [*self.seeds[:_STARTS], *ways[-_STARTS:]]
-        self.weigher.weigh([Start(self.base, self._bare(z), 0.0) for z in starts])
-        best = self.found.of(self.base, "white")
-        if best is not None and np.isfinite(best.log_evidence):
-            head = self.problem.head
-            spread = np.ptp(np.stack(starts)[:, :head], axis=0) + 1e-300
-            self.seed = min(starts, key=lambda z: float((((z - best.z)[:head] / spread) ** 2).sum()))
-
     def along(self, members: Sequence[int]) -> list[Start]:
         """Where each of some effects begins alone, by the force that the simulation misses."""
-        return self.prospects.along(self._null, 1, members)
-
-    @property
-    def _null(self) -> PathFit:
-        """The best path of the simulation without effects."""
-        return max(self.null_paths, key=lambda fit: fit.log_evidence)
+        return self.prospects.along(self.beginning.best, 1, members)
 
     def again(self, stepper: Stepper) -> Found:
         """Fit and weigh the best combinations anew with another stepper of the same recordings."""
@@ -186,10 +117,10 @@ class Search:
         white = before.of(self.base, "white")
         if white is not None and self.white(self.base) < white.log_evidence - _REACH:
             # What goes round once more between two readings looks alike in coarse steps.
-            w.weigh([Start(self.base, self._bare(z), 0.0) for z in self.seeds[:_STARTS]])
+            w.weigh([Start(self.base, self.beginning.bare(z), 0.0) for z in self.beginning.seeds[:STARTS]])
         if self.in_time():
             self.refinement.move_places()
-        w.add_paths(fit_paths(w.stepper, self.null_paths, w.found.priors, self.rows, 3))
+        w.add_paths(fit_paths(w.stepper, self.beginning.paths, w.found.priors, self.rows, 3))
         self._weigh_remainders()
         self._weigh_forces()
         self._weigh_spells()
@@ -217,7 +148,9 @@ class Search:
         w.moved_to(stepper, Found(stepper.problem, priors, kept, before.complete))
         w.owed = {renumbered(c): value for c, value in w.owed.items()}
         w.base = renumbered(w.base)
-        self.null_paths = [replace(path, combination=renumbered(path.combination)) for path in self.null_paths]
+        self.beginning.paths = [
+            replace(path, combination=renumbered(path.combination)) for path in self.beginning.paths
+        ]
         self.prospects, self.remainders = Prospects(w), Remainders(w, self.progress)
         self.refinement = Refinement(self.prospects, self.progress)
 
@@ -235,13 +168,6 @@ class Search:
     def _size(self, combination: Combination) -> int:
         """Effects beside outliers that are taken out."""
         return len(combination) - len(self.base)
-
-    def from_seed(self) -> np.ndarray:
-        return self._bare(self.seed)
-
-    def _bare(self, z: np.ndarray) -> np.ndarray:
-        """The same without effects."""
-        return np.where(np.arange(len(z)) < self.problem.slots, z, 0.0)
 
     def in_time(self) -> bool:
         if time.monotonic() > self.deadline:
@@ -288,7 +214,7 @@ class Search:
             if small := self._varied(scanned):
                 self.weigher.weigh(small, whole=True)
             return
-        along = promising(self.prospects.along(self._null, _FEW), _REACH)
+        along = promising(self.prospects.along(self.beginning.best, _FEW), _REACH)
         plain = {self._with(c) for c in self.problem.searched if not self.problem.candidate(c).effect.places}
         first = promising(scanned, _REACH) + [s for s in along if s.combination not in plain]
         if first:
@@ -313,7 +239,7 @@ class Search:
         return [start for alike in kept.values() for start in alike]
 
     def _from_nothing(self, combination: Combination) -> Start:
-        return Start(combination, self.from_seed(), 0.0)
+        return Start(combination, self.beginning.from_seed(), 0.0)
 
     def _weigh_in_batches(self, starts: Sequence[Start], whole: bool = False) -> None:
         """As many as there is time for."""
@@ -328,7 +254,7 @@ class Search:
         alone = [c for c in self.found.estimates if self._size(c) == 1]
         best = max(alone, key=self.found.best, default=self.base)
         white = self.found.of(best, "white")
-        rest = max(self.found.best(self.base), self._null.log_evidence)
+        rest = max(self.found.best(self.base), self.beginning.best.log_evidence)
         if (
             not alone
             or white is None
@@ -384,7 +310,7 @@ class Search:
         alone = -np.inf if white is None else white.log_evidence + self.found.prices.log(self.base)
         if self.found.odds(best) > alone + _WORTH and self.in_time():
             self.progress("weighing forces that act for a while")
-            Spells(self.prospects, self.typical).weigh(best, _REACH)
+            Spells(self.prospects, self.beginning.typical).weigh(best, _REACH)
 
     def _weigh_with_outliers_in(self) -> None:
         if self.base:
@@ -396,6 +322,6 @@ class Search:
         for c in combinations:
             white = self.found.of(c, "white")
             assert white is not None  # every combination is weighed under white noise first
-            starts += beside(self._null, self.problem, self.rows, self.typical, c, white.z, every)
+            starts += beside(self.beginning.best, self.problem, self.rows, self.beginning.typical, c, white.z, every)
         w = self.weigher
         w.add_paths(fit_paths(w.stepper, starts, self.found.priors, self.rows, w.path_steps))
