@@ -6,8 +6,9 @@ import pytest
 
 from symplearn._smoother import smooth
 from symplearn.diagnosis._path import linearise
+from symplearn.diagnosis._path_filter import filter_along
 from symplearn.diagnosis._problem import SLOTS
-from symplearn.diagnosis._stochastic import run_filter, run_smoother
+from symplearn.diagnosis._stochastic import free_run, run_filter
 from symplearn.diagnosis._trajectory import Stepper
 
 G, DRAG, PUSH, RATE = 9.81, 0.3, 0.5, 2.0
@@ -106,19 +107,22 @@ def test_what_is_not_covered_is_still(stepper):
 
 
 def test_smoothing_with_slopes_is_the_unscented_smoother_where_the_spread_is_small(stepper):
-    """At a noise of 1e-4 the slopes at the filter's means are those over its spread: means, forces and strains of both
-    smoothers agree to what the spread's square is, relative to the largest."""
+    """At a noise of 1e-4 the slopes along a trajectory are those over the filter's spread: means, forces and strains of
+    both smoothers agree to the spread, relative to the largest."""
     p, course = stepper.problem, stepper.courses[0]
     z = np.zeros(p.size)
     z[[0, 2]], z[p.head] = [1.0, 0.2], G
     noise, spread = np.full(1, 1e-4), 1e-8 * np.diag([1.0, 0.0, 1.0, 0.0])
-    readings = np.where(np.arange(N)[:, None] % 3 == 1, np.nan, p.rows[0].readings)
+    read = p.rows[0].readings + noise * np.random.default_rng(7).normal(size=(N, 1))
+    readings = np.where(np.arange(N)[:, None] % 3 == 1, np.nan, read)
     parts, filtered = run_filter(p, course, 0, z, (), noise, 0 * noise, np.full(1, 1e-6), spread, readings)
     assert bool(filtered.ok)
     model, spans, contexts = parts
-    expected, found = smooth(model, filtered, spans, contexts), run_smoother(stepper, 0, z, (), parts, filtered)
+    path, few = free_run(p, course, z, (), 0, z[: p.state], 0)[1], np.full(1, 1e-6)
+    expected = smooth(model, filtered, spans, contexts)
+    _, found = filter_along(stepper, 0, z, (), path, noise, 0 * noise, few, spread, readings)
     for name in ("means", "disturbances", "standardised_disturbances", "residuals", "standardised_residuals"):
         ours, theirs = (np.asarray(getattr(one, name)) for one in (found, expected))
         assert np.abs(theirs).max() > 0
-        # The square of what the spread grows to between readings, seen below 1e-5.
-        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-4 * np.abs(theirs).max(), err_msg=name)
+        # The curvature over some spreads, which is how far the readings lead from the trajectory: 4e-4 was seen.
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-3 * np.abs(theirs).max(), err_msg=name)

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
@@ -17,12 +16,9 @@ from ._held_out import HeldOut, one_off
 from ._lasting import colour_ratio, total_noise
 from ._path_filter import filter_along, prolonged
 from ._reach import covariance_within_reach
-from ._stochastic import free_run, row_roots, run_filter, run_smoother
+from ._stochastic import free_run, row_roots
 from ._trajectory import Stepper
 from ._weighed import Estimate
-
-# A filter whose innovations are on average so many times as large as it expects, squared, has lost the motion.
-_LOST = 25.0
 
 
 def intensity_of(stepper: Stepper, estimate: Estimate) -> Float[np.ndarray, " d"]:
@@ -30,20 +26,13 @@ def intensity_of(stepper: Stepper, estimate: Estimate) -> Float[np.ndarray, " d"
     return np.zeros(stepper.problem.equations.dim) if estimate.intensity is None else estimate.intensity
 
 
-@np.errstate(invalid="ignore", over="ignore")
-def _strain(filtered: Filtered) -> float:
-    """Mean square of the standardised innovations; infinite where the filter failed."""
-    squares = np.asarray(filtered.standardised_innovations)[np.asarray(filtered.observed)] ** 2
-    value = float(squares.mean()) if len(squares) else 0.0
-    return value if bool(filtered.ok) and np.isfinite(value) else np.inf
-
-
 @dataclass(frozen=True, eq=False)
 class Outlook:
     """An estimate on one recording. Times, readings and predictions are by row after thinning.
 
-    Where no force disturbs the motion, it is the fitted trajectory. A filter's sigma points, as far apart as the start
-    is uncertain, may lose that: about an eccentric orbit one was seen to end four hundred times too far out.
+    Where no force disturbs the motion, it is the fitted trajectory; else a filter goes about the most probable path.
+    Sigma points, as far apart as the start is uncertain, may lose either: about an eccentric orbit they were seen to
+    end four hundred times too far out.
     """
 
     stepper: Stepper
@@ -58,38 +47,14 @@ class Outlook:
         return self.stepper.problem.rows[self.recording]
 
     @cached_property
-    def _filtered(self) -> tuple[Any, Filtered]:
-        """What the filter was given and what it says; about the most probable path where sigma points lost it."""
-        given, filtered = self._by_sigma_points
-        followed = filtered if self._along_its_path is None else self._along_its_path[0]
-        return given, followed
-
-    @cached_property
-    def _along_its_path(self) -> tuple[Filtered, Smoothed] | None:
-        """Filtered and smoothed about the estimate's own path, where that follows the readings and sigma points do
-        not."""
-        given, filtered = self._by_sigma_points
-        if _strain(filtered) < _LOST:
-            return None
-        e, r = self.estimate, self.recording
-        path = self._trajectory[1][: self.rows.fitted] if e.paths is None else e.paths[r]
-        whole = prolonged(self.stepper, r, e.z, e.combination, path)
-        if not np.isfinite(whole).all():
-            return None
-        found = filter_along(self.stepper, r, e.z, e.combination, whole, given, self._start_spread,
-                             self._straight[: self.rows.fitted])  # fmt: skip
-        return found if _strain(found[0]) < _strain(filtered) else None
-
-    @cached_property
-    def _by_sigma_points(self) -> tuple[Any, Filtered]:
-        e, r = self.estimate, self.recording
-        given, filtered = run_filter(
-            self.stepper.problem, self.stepper.courses[r], r, e.z, e.combination, total_noise(e), colour_ratio(e),
-            self.intensity, self._start_spread, self._straight[: self.rows.fitted],
-            self.exposures,
+    def _passed(self) -> tuple[Filtered, Smoothed]:
+        """Of filter and smoother, about the estimate's most probable path, or about its trajectory."""
+        e, r, n = self.estimate, self.recording, self.rows.fitted
+        path = self._trajectory[1][:n] if e.paths is None else e.paths[r]
+        return filter_along(
+            self.stepper, r, e.z, e.combination, prolonged(self.stepper, r, e.z, e.combination, path), total_noise(e),
+            colour_ratio(e), self.intensity, self._start_spread, self._straight[:n], self.exposures,
         )  # fmt: skip
-        # As NumPy's: every part of JAX's that is looked at outside of compiled code is a program of its own.
-        return given, jax.tree.map(np.asarray, filtered)
 
     @cached_property
     def _straight(self) -> Float[np.ndarray, "time channel"]:
@@ -128,17 +93,13 @@ class Outlook:
     @property
     def ok(self) -> bool:
         """Whether the filter, or the trajectory, went through the fitted rows."""
-        if self._is_free:
-            return bool(np.isfinite(self._trajectory[1][: self.rows.fitted]).all())
-        return bool(self._filtered[1].ok)
+        states = self._trajectory[1] if self._is_free else self._passed[0].filtered_means
+        return bool(np.isfinite(states[: self.rows.fitted]).all())
 
-    @cached_property
+    @property
     def smoothed(self) -> Smoothed:
         """State and noises given all fitted rows."""
-        e = self.estimate
-        if self._along_its_path is not None:
-            return self._along_its_path[1]
-        return run_smoother(self.stepper, self.recording, e.z, e.combination, *self._filtered)
+        return self._passed[1]
 
     @cached_property
     def last_state(self) -> Float[np.ndarray, " state"]:
@@ -146,7 +107,7 @@ class Outlook:
         filter failed."""
         last = self.rows.fitted - 1
         if self.ok and not self._is_free:
-            return np.asarray(self._filtered[1].filtered_means[last])
+            return np.asarray(self._passed[0].filtered_means[last])
         return self._trajectory[1][last]
 
     @cached_property
@@ -173,7 +134,7 @@ class Outlook:
         if self._is_free:
             shown = self._trajectory[0][: self.rows.fitted]
         else:
-            shown = self.along(readings, np.asarray(self._filtered[1].filtered_means[: self.rows.fitted]))
+            shown = self.along(readings, np.asarray(self._passed[0].filtered_means[: self.rows.fitted]))
         return bent(shown, self.rows.times[: self.rows.fitted], self.estimate.bends)
 
     def along(self, what: What, states: Float[np.ndarray, "row state"]) -> np.ndarray:
@@ -188,7 +149,7 @@ class Outlook:
         if self._is_free:
             errors = (self.rows.readings - self.readings) / self._noise
             return np.where(np.isnan(self.rows.readings), 0.0, errors)[: self.rows.fitted]
-        return np.asarray(self._filtered[1].standardised_innovations[: self.rows.fitted])
+        return np.asarray(self._passed[0].standardised_innovations[: self.rows.fitted])
 
     def held_out_errors(self, times: np.ndarray, readings: np.ndarray) -> Float[np.ndarray, "row channel"]:
         """Readings minus the free run at original times after the last fitted row; NaN where nothing was read."""
@@ -211,7 +172,7 @@ class Outlook:
         """Variance of every reading when the unknowns are known: of the noise, and of what the filter cannot tell."""
         if self._is_free:
             return self._noise**2
-        S = np.asarray(self._filtered[1].innovation_covariances[: len(self.rows.times)])
+        S = np.asarray(self._passed[0].innovation_covariances[: len(self.rows.times)])
         return np.diagonal(S, axis1=1, axis2=2) / self._roots() ** 2
 
     def _unsure(self, inflation: float) -> Float[np.ndarray, "held channel"]:

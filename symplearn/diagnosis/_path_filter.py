@@ -5,7 +5,7 @@ motion, they may lose it, though a fit of the whole path has found it. About tha
 pass of an iterated extended smoother, Bell 1994).
 """
 
-from typing import Any
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -18,50 +18,50 @@ from .._filter import Filtered
 from .._smoother import Smoothed, smooth_along
 from ._path import linearise
 from ._problem import SLOTS, Combination
-from ._stochastic import free_run, padded
+from ._stochastic import MissingForce, exposure, free_run, padded, row_roots, softness
 from ._trajectory import Stepper
 
 
 def prolonged(
     stepper: Stepper, recording: int, z: Float[np.ndarray, " z"], combination: Combination, path: np.ndarray
 ) -> Float[np.ndarray, "time state"]:
-    """A path of the leading rows that runs on freely over the others."""
+    """A path of the leading rows that runs on freely over the others; where it diverges there, it stays."""
     last = len(path) - 1
     _, later = free_run(stepper.problem, stepper.courses[recording], z, combination, recording, path[last], last)
+    bad = ~np.isfinite(later).all(1)
+    later[bad] = path[last]
     return np.concatenate([path[:last], later])
 
 
 def filter_along(
     stepper: Stepper, recording: int, z: Float[np.ndarray, " z"], combination: Combination,
-    path: Float[np.ndarray, "time state"], given: Any, spread: Float[np.ndarray, "state state"],
-    readings: Float[np.ndarray, "row channel"],
+    path: Float[np.ndarray, "time state"], noise: Float[np.ndarray, " channel"], ratio: Float[np.ndarray, " channel"],
+    intensity: Float[np.ndarray, " d"], spread: Float[np.ndarray, "state state"],
+    readings: Float[np.ndarray, "row channel"], exposures: Sequence[np.ndarray] | None = None,
 ) -> tuple[Filtered, Smoothed]:  # fmt: skip
-    """What `run_filter` and `run_smoother` tell, about a path of all rows; `given` and the rest are as for the former.
-    Of the likelihood nothing is told."""
-    model, (spans, acting), (_, roots) = given
-    problem, length = stepper.problem, len(np.asarray(roots))
+    """Filter and smooth a recording about a path of all its rows, from the phase point in `z` with covariance `spread`;
+    the rest as for `run_filter`. Of the likelihood nothing is told.
+    """
+    problem, course = stepper.problem, stepper.courses[recording]
+    length = course.times.shape[0]
     hot = np.zeros((1, SLOTS + 1, problem.equations.size))
     hot[0, -1] = problem.coefficients(recording, z, combination) - problem.coefficients(recording, z, ())
     values = np.concatenate([z[problem.head : problem.slots], np.zeros(SLOTS)])[None]
     whole = np.concatenate([path, np.repeat(path[-1:], length - len(path), axis=0)])
     known = padded(readings, length, np.nan)
     linear = linearise(stepper, recording, whole[None], values, hot, [np.zeros(0, int)], np.nan_to_num(known))
-    scale = np.asarray(roots)
+    scale = row_roots(problem, recording, length, ratio)
+    soft = softness(problem, course, z, recording)
+    force = MissingForce(jnp.asarray(intensity), jnp.asarray(soft), int(problem.equations.hidden))
+    spans = jax.tree.map(lambda leaf: leaf[: length - 1], (course.spans, exposure(exposures, recording, length)))
+    flow = linear.defect[0, :-1], linear.A[0, :-1]
+    read = linear.residual[0] * scale, linear.H[0] * scale[..., None], ~np.isnan(known)
     first = z[recording * problem.state : (recording + 1) * problem.state] - path[0]
-    parts = (
-        (linear.defect[0, :-1], linear.A[0, :-1]),
-        (linear.residual[0] * scale, linear.H[0] * scale[..., None], ~np.isnan(known)),
-    )
-    found, A, H, Q, R = _pass(
-        model.process_noise, model.measurement_noise.variance, (spans, acting), *parts, first, spread
-    )
-    filtered = jax.tree.map(np.asarray, found)
-    filtered = eqx.tree_at(
-        lambda one: (one.predicted_means, one.filtered_means),
-        filtered,
-        (filtered.predicted_means + whole, filtered.filtered_means + whole),
-    )
-    return filtered, jax.tree.map(np.asarray, _smooth(filtered, A, Q, H, R))
+    found, *slopes = _pass(force, noise**2, spans, flow, read, first, spread)
+    found = jax.tree.map(np.asarray, found)
+    moved = found.predicted_means + whole, found.filtered_means + whole
+    found = eqx.tree_at(lambda one: (one.predicted_means, one.filtered_means), found, moved)
+    return found, jax.tree.map(np.asarray, _smooth(found, *slopes))
 
 
 @eqx.filter_jit
@@ -90,7 +90,7 @@ def _pass(force, variance, spans, flow, read, first, spread):
     nothing, fault = jnp.zeros(len(residual)), jnp.where(jnp.isfinite(after).all(), Fault.NONE, Fault.STATE)
     found = Filtered(nothing.sum(), nothing, before, prior, after, posterior, innovations, spreads, standard, observed,
                      fault, jnp.asarray(-1))  # fmt: skip
-    return found, A, seen, Q, jnp.broadcast_to(R, (len(residual), *R.shape))
+    return found, A, Q, seen, jnp.broadcast_to(R, (len(residual), *R.shape))
 
 
 _smooth = eqx.filter_jit(smooth_along)

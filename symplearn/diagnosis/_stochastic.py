@@ -15,13 +15,11 @@ from .._augmented_flow import Span
 from .._filter import Filtered, unscented_filter
 from .._lane_loops import with_lane_loops
 from .._model import Gaussian, StateSpaceModel
-from .._smoother import Smoothed, smooth_along
 from ._calibrate import THINNED
 from ._course import Course, model_at
 from ._native_rows import native_rows
 from ._native_steps import run_natively
-from ._path import Linear, linearise
-from ._problem import SLOTS, Combination, Problem
+from ._problem import Combination, Problem
 from ._trajectory import Stepper
 
 
@@ -94,12 +92,6 @@ def filter_lane(
 _filter = eqx.filter_jit(filter_lane)
 
 
-@eqx.filter_jit
-def _smooth(filtered, force, spans, A, H, variance):
-    R = jnp.broadcast_to(jnp.diag(variance), (H.shape[0], *[variance.shape[0]] * 2))
-    return smooth_along(filtered, A, jax.vmap(force.covariance)(spans), H, R)
-
-
 def row_roots(problem: Problem, recording: int, length: int, ratio: Float[np.ndarray, " channel"]) -> np.ndarray:
     """Square root of each row's information in units of one reading's (time, channel); 1 where there is none.
 
@@ -168,27 +160,6 @@ def run_filter(
         jax.device_put(row_roots(problem, recording, length, ratio)),
     )
     return (model, spans, contexts), filtered
-
-
-def run_smoother(
-    stepper: Stepper, recording: int, z: Float[np.ndarray, " z"], combination: Combination, parts: Any,
-    filtered: Filtered,
-) -> Smoothed:  # fmt: skip
-    """Smooth what `run_filter` filtered, with the slopes of flow and readings at the filter's means: those over the
-    filter's spread, which is small beside the motion, would need one more program that holds the flow."""
-    problem, (model, (spans, acting), (_, roots)) = stepper.problem, parts
-    hot = np.zeros((1, SLOTS + 1, problem.equations.size))
-    hot[0, -1] = problem.coefficients(recording, z, combination) - problem.coefficients(recording, z, ())
-    values = np.concatenate([z[problem.head : problem.slots], np.zeros(SLOTS)])[None]
-    readings = np.where(np.asarray(filtered.observed), 0.0, np.nan)
-
-    def about(means: np.ndarray) -> Linear:
-        return linearise(stepper, recording, means[None], values, hot, [np.zeros(0, int)], readings)
-
-    A = about(np.asarray(filtered.filtered_means)).A[0, :-1]
-    H = about(np.asarray(filtered.predicted_means)).H[0] * np.asarray(roots)[..., None]
-    smoothed = _smooth(filtered, model.process_noise, (spans, acting), A, H, model.measurement_noise.variance)
-    return jax.tree.map(np.asarray, smoothed)
 
 
 def free_run(
