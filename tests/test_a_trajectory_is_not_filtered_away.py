@@ -6,6 +6,7 @@ import pytest
 
 from symplearn._smoother import smooth
 from symplearn.diagnosis._calibrate import calibrate
+from symplearn.diagnosis._locate import where_sentence
 from symplearn.diagnosis._outlook import Outlook
 from symplearn.diagnosis._path_filter import filter_along
 from symplearn.diagnosis._start import priors_without_effects
@@ -77,6 +78,7 @@ def test_what_is_shown_is_the_trajectory(eccentric):
     errors = np.nan_to_num(outlook.rows.readings - path[:, 2:3])[:n] / NOISE  # rows between readings have none
     np.testing.assert_allclose(outlook.innovations, errors, atol=1 / 500)
     assert not outlook.missing_force().any() and not outlook.strain().any() and outlook.ok
+    assert where_sentence(p, outlook, 1) == "no missing force on y can be followed by itself"
 
 
 def test_an_orbit_that_sigma_points_lose_is_followed(grazing):

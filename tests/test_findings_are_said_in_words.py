@@ -73,6 +73,14 @@ def test_what_it_does_has_the_sign_and_number_of_its_coefficients(name, changed,
     assert words in said(name, units=units, **changed)
 
 
+@pytest.mark.parametrize("name", ["impulse", "regime_change"])
+def test_a_time_keeps_its_digits(name):
+    """A time of a clock that has run for years is told to a thousandth, one of a short recording in four digits."""
+    assert "at t = 1700000013.37" in (text := said(name, t_star=1700000013.37).replace("From t", "at t"))
+    assert "t_star = 1700000013.37 +- " in text and "1.7e+09" not in text
+    assert "t_star = 13.37 +- " in said(name, t_star=13.3712)
+
+
 @pytest.mark.parametrize("name", ["viscous_damping", "quadratic_drag", "coulomb_friction", "relative_damping"])
 def test_a_loss_that_is_taken_back_is_no_loss_left_out(name):
     """A negative coefficient is added to a known term that is too strong: nothing was left out, and less is lost."""

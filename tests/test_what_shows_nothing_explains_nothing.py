@@ -71,6 +71,7 @@ def test_a_start_in_another_unit_is_no_agreement():
     document = diagnose(*pendulum(68.75), Options(restriction=only)).document
     assert document["verdict"] == "unexplained" and document["findings"] == []
     assert any("constants and noise tell the readings as well" in one for one in document["warnings"])
+    assert document["location"]["where"].endswith("so that nothing is located")
 
 
 def test_a_start_that_is_right_is_agreement():

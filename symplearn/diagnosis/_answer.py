@@ -310,6 +310,8 @@ class Answer:
                 where = where_sentence(self.problem, self.lens[0], strained[0])
                 found = strained_when(self.lens, strained)
             windows = [[*w, r] if several else w for w, r in found]
+        if self.posterior.is_constant:
+            where = "nothing that was read shows the simulated motion, so that nothing is located"
         return {"kind": kind, "targets": targets, "recordings": numbers, "time_windows": windows, "where": where}
 
     def _series(self, r: int) -> Series:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .._effects import Candidate, takes_back
-from ._law_text import number
+from ._law_text import moment, number
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,8 @@ class Said:
 
     def _spread(self, name: str, factor: float) -> str:
         mean, sd = (self.coefficients[name].get(key) for key in ("mean", "sd"))
-        return number(factor * mean) + ("" if sd is None else f" +- {number(abs(factor) * sd)}")
+        shown = moment(mean) if name == "t_star" else number(factor * mean)
+        return shown + ("" if sd is None else f" +- {number(abs(factor) * sd)}")
 
     @property
     def period(self) -> str:

@@ -67,12 +67,17 @@ def number(value: float) -> str:
     return f"{value:.4g}"
 
 
+def moment(time: float) -> str:
+    """A time, of a clock that may have run for years: to three decimals where four digits would say less."""
+    return number(time) if abs(time) < 1000 else f"{time:.3f}".rstrip("0").rstrip(".")
+
+
 def law_text(one: Candidate, coefficients: Mapping[str, Any]) -> str:
     """The law of one effect with its numbers, `F = -0.03 v`.
 
     **Arguments:** - `coefficients`: those of the contract by name; for `unnamed_force` its `expression`, a text.
     """
-    return _law(one, {name: _shown(value) for name, value in coefficients.items()})
+    return _law(one, {name: _shown(name, value) for name, value in coefficients.items()})
 
 
 def symbolic_law(one: Candidate, memory: str = "w") -> str:
@@ -108,7 +113,7 @@ def equation_lines(
     further: list[str] = []
     unseen = _free_names({*coordinates, *momenta, *columns}, [one for one, _ in chosen])
     for number_, (one, coefficients) in enumerate(chosen):
-        values = {name: _shown(value) for name, value in coefficients.items()}
+        values = {name: _shown(name, value) for name, value in coefficients.items()}
         names = _names(one, f"d{one.targets[0]}/dt", f"d{one.targets[-1]}/dt") | {"z": unseen.get(number_, "z")}
         for q, template in zip(one.targets, _FORCES.get(_key(one), ()), strict=False):
             added[q].append(_filled(template, names | values | _composed(coefficients)))
@@ -150,8 +155,10 @@ def _key(one: Candidate) -> str:
     return f"{one.effect.name}, lower" if one.side == "lower" else one.effect.name
 
 
-def _shown(value: float | str) -> str:
-    return value if isinstance(value, str) else number(value)
+def _shown(name: str, value: float | str) -> str:
+    if isinstance(value, str):
+        return value
+    return moment(value) if name == "t_star" else number(value)
 
 
 def _filled(template: str, names: Mapping[str, str]) -> str:
@@ -185,7 +192,7 @@ def _free_names(taken: set[str], chosen: Sequence[Candidate]) -> dict[int, str]:
 def _own_lines(one: Candidate, coefficients: Mapping[str, Any], unseen: str, momentum: Mapping[str, str]) -> list[str]:
     """Lines that an effect of the dynamics adds to the equations."""
     if one.effect.name == "impulse":
-        jump, when = number(coefficients["j"]), number(coefficients["t_star"])
+        jump, when = number(coefficients["j"]), moment(coefficients["t_star"])
         return [f"{momentum[one.targets[0]]} jumps by {jump} at t = {when}"]
     if one.effect.name == "hidden_oscillator":
         square, kappa = number(coefficients["omega"] ** 2), number(coefficients["kappa"])
@@ -198,7 +205,7 @@ def _parameter_lines(chosen: Sequence[tuple[Candidate, Mapping[str, Any]]]) -> l
     factors: dict[str, list[str]] = {}
     for one, coefficients in chosen:
         if one.effect.acts_on == PARAMETER:
-            values = {name: number(value) for name, value in coefficients.items()}
+            values = {name: _shown(name, value) for name, value in coefficients.items()}
             factors.setdefault(one.targets[0], []).append(_filled(_FACTORS[one.effect.name], values))
     constant = {one.targets[0] for one, _ in chosen if one.effect.name == "parameter_error"}
     return [

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._effects import IMPULSE, Candidate
-from ._law_text import number
+from ._along import force
+from ._law_text import moment
 from ._outlook import Outlook
 from ._problem import Combination, Problem
 
@@ -15,6 +16,8 @@ _STRETCHES = 24
 # A stretch stands out when its mean square is this many times that of most, and nearly as large as the force's own
 # intensity would have it: where most of the recording is quiet that is fitted to what stands out.
 _STANDS_OUT, _STRONG = 2.5, 0.7
+# Share of the forces already there below which a missing one goes with nothing: a fit that needs none leaves as much.
+_NOTHING = 1e-5
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,8 @@ def where_sentence(problem: Problem, outlook: Outlook, coordinate: int) -> str:
     name = problem.equations.coordinates[coordinate]
     if not np.isfinite(outlook.missing_force()).all():
         return f"the simulation of {name} diverges from the recording, so that no missing force can be followed"
+    if _is_nothing(outlook, coordinate):
+        return f"no missing force on {name} can be followed by itself"
     shares = explained(outlook, coordinate)
     speed, place = (f"{100 * max(0.0, x):.0f} %" for x in (shares.speed, shares.place))
     alone = [word for word, share in (("its speed", shares.speed), ("its place", shares.place)) if share > 0.6]
@@ -157,7 +162,13 @@ def where_sentence(problem: Problem, outlook: Outlook, coordinate: int) -> str:
     )
 
 
+def _is_nothing(outlook: Outlook, coordinate: int) -> bool:
+    """Whether a missing force is nothing beside those that are there."""
+    there, missing = outlook.along(force, outlook.states)[:, coordinate], outlook.missing_force()[:, coordinate]
+    return bool(np.linalg.norm(missing) <= _NOTHING * np.linalg.norm(there))
+
+
 def blows_sentence(blows: Sequence[Candidate], times: Sequence[float]) -> str:
     """What is struck, and when: a blow goes with neither speed nor place."""
-    struck = [f"a blow to {one.targets[0]} at t = {number(t)}" for one, t in zip(blows, times, strict=True)]
+    struck = [f"a blow to {one.targets[0]} at t = {moment(t)}" for one, t in zip(blows, times, strict=True)]
     return " and ".join(struck)

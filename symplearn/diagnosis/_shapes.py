@@ -13,6 +13,7 @@ from .._effects import Nameless
 from .._simulation_records import SimulationFile
 from .._symbolic import derivative
 from ._along import along, force
+from ._law_text import moment
 from ._locate import strained_coordinates
 from ._outlook import Outlook
 from ._sweeps import Sweep, swept
@@ -200,7 +201,7 @@ def _in_a_swing(i: int, name: str, q: sympy.Expr, v: sympy.Expr, low: float, hig
 def _sweep(i: int, name: str, middle: Sweep, number: int) -> Family:
     def law(first: float, last: float) -> Nameless:
         moved = replace(middle, first=_rounded(first, 7), last=_rounded(last, 7))
-        begin, end = (f"{2 * np.pi / one:.6g} at t = {t:.4g}"
+        begin, end = (f"{2 * np.pi / one:.6g} at t = {moment(t)}"
                       for one, t in ((moved.first, moved.start), (moved.last, moved.start + moved.span)))  # fmt: skip
         as_what = " and the square of its frequency, as of an unbalance" if middle.grows else ""
         words = f"swings in time, on {name}, with a period from {begin} to {end}{as_what}"

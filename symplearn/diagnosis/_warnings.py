@@ -9,6 +9,7 @@ import numpy as np
 from .._recording import Recording
 from .._simulation_records import SimulationFile
 from ._found import Found
+from ._law_text import moment
 from ._locate import spell_windows
 from ._nameless import is_clear
 from ._outlook import Outlook
@@ -152,7 +153,7 @@ def _when(problem: Problem, recordings: Sequence[Recording], best: Estimate) -> 
     """From when to when a remainder acts that does not always."""
     acts = spell_windows(problem, best.exposures) if best.exposures is not None else []
     where = [f" in recording {recordings[r].number}" if len(recordings) > 1 else "" for r, _ in acts]
-    return "".join(f", t = {w[0]:g} to {w[1]:g}{run}" for (_, w), run in zip(acts, where, strict=True))
+    return "".join(f", t = {moment(w[0])} to {moment(w[1])}{run}" for (_, w), run in zip(acts, where, strict=True))
 
 
 def strayed(outlook: Outlook, recording: Recording, is_one_of_several: bool) -> list[str]:
@@ -180,9 +181,9 @@ def far_off(forecast: Forecast, recording: Recording) -> list[str]:
         for label in ("before", "after"):
             if (lost := ~np.isfinite(column[label] + column[f"{label}_sd"])).any():
                 out.append(f"the forecast of {name} {label} the findings is empty from t = "
-                           f"{forecast.times[lost][0]:g} on: the trajectory diverges there")  # fmt: skip
+                           f"{moment(forecast.times[lost][0])} on: the trajectory diverges there")  # fmt: skip
         for label in ("before", "after"):
             if (off := _off(column[label], read[~np.isnan(read)])).any():
                 out.append(f"the forecast of {name} {label} the findings leaves all that was read by more than "
-                           f"{_FAR:g} times its range from t = {forecast.times[off][0]:g} on")  # fmt: skip
+                           f"{_FAR:g} times its range from t = {moment(forecast.times[off][0])} on")  # fmt: skip
     return out
