@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from symplearn._recording import Recording
-from symplearn.diagnosis._forecast import _DRAWS, _summary
+from symplearn.diagnosis._forecast import _DRAWS, _resolved, _summary
 from symplearn.diagnosis._record import Forecast
 from symplearn.diagnosis._warnings import far_off
 
@@ -65,3 +65,17 @@ def test_what_is_not_known_is_said():
     lost = np.where(np.arange(5) < 3, 0.5, np.nan)
     (said,) = far_off(forecast(np.cos(np.arange(5)), lost), READ)
     assert "y after the findings is empty from t = 13 on" in said
+
+
+def test_draws_that_shorter_substeps_change_are_left_out_from_then_on():
+    """A draw that passes a centre in too long steps is not looked at from where shorter ones would lead it elsewhere,
+    by more than draws differ and readings err; what shifts by less is."""
+    fine, noise = np.random.default_rng(3).normal(size=(40, 6, 2)), np.array([0.1, 0.1])
+    coarse = fine + 0.5
+    coarse[7, 3, 1] += 50.0  # and back
+    coarse[9, 4] = np.nan
+    kept = _resolved(coarse, fine, noise)
+    assert kept[7].tolist() == [True] * 3 + [False] * 3 and kept[9].tolist() == [True] * 4 + [False] * 2
+    assert kept[[k for k in range(40) if k not in (7, 9)]].all()
+    known = np.tile(np.linspace(1.0, 2.0, 6)[None, :, None], (40, 1, 2))
+    assert _resolved(known + 0.09, known, noise).all() and not _resolved(known + 0.11, known, noise).any()
