@@ -139,7 +139,8 @@ def _resolved(
 ) -> Bool[np.ndarray, "draw time"]:  # fmt: skip
     """Up to when shorter substeps change a draw by less than draws differ, or readings err. One that passes closer to a
     centre than the motion that was fitted is thrown out far, by no force."""
-    low, high = np.nanquantile(np.where(np.isfinite(fine), fine, np.nan), _WITHIN, axis=0)
+    some = np.isfinite(fine).any(0)  # where none has stayed finite there are no quantiles, and none is kept
+    low, high = np.nanquantile(np.where(np.isfinite(fine) | ~some, np.where(some, fine, 0.0), np.nan), _WITHIN, axis=0)
     return np.logical_and.accumulate((np.abs(fine - coarse) <= high - low + noise).all(2), axis=1)
 
 
