@@ -20,9 +20,13 @@ def place(problem, effect, target):
 
 
 def estimate(problem, combination, log_evidence, kind="white", sd=0.01):
-    """A hand-made record: every coefficient known to `sd`, in units of its prior's."""
+    """A hand-made record: every coefficient known to `sd`, in units of its prior's. Sudden changes come in the middle
+    of the recording: what changes at its beginning was not seen to change."""
     covariance = np.diag(np.full(problem.size, sd**2))
     nothing, noise = np.zeros(problem.size), np.ones(problem.channels)
+    for member, entries in problem.placed(combination):
+        if problem.candidate(member).effect.name == "regime_change":
+            nothing[entries.stop - 1] = 4.5
     return Estimate(combination, kind, nothing, covariance, noise, log_evidence, True)
 
 
