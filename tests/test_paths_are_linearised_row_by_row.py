@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from symplearn._smoother import smooth
+from symplearn.diagnosis import _path_filter as path_filter
 from symplearn.diagnosis._path import linearise
 from symplearn.diagnosis._path_filter import filter_along
 from symplearn.diagnosis._problem import SLOTS
@@ -120,7 +121,7 @@ def test_smoothing_with_slopes_is_the_unscented_smoother_where_the_spread_is_sma
     model, spans, contexts = parts
     path, few = free_run(p, course, z, (), 0, z[: p.state], 0)[1], np.full(1, 1e-6)
     expected = smooth(model, filtered, spans, contexts)
-    _, found = filter_along(stepper, 0, z, (), path, noise, 0 * noise, few, spread, readings)
+    found = path_filter.smooth(*filter_along(stepper, 0, z, (), path, noise, 0 * noise, few, spread, readings))
     for name in ("means", "disturbances", "standardised_disturbances", "residuals", "standardised_residuals"):
         ours, theirs = (np.asarray(getattr(one, name)) for one in (found, expected))
         assert np.abs(theirs).max() > 0

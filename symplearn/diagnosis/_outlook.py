@@ -14,7 +14,7 @@ from ._along import What, along, readings
 from ._bend import bent
 from ._held_out import HeldOut, one_off
 from ._lasting import colour_ratio, total_noise
-from ._path_filter import filter_along, prolonged
+from ._path_filter import Slopes, filter_along, prolonged, smooth
 from ._reach import covariance_within_reach
 from ._stochastic import free_run, row_roots
 from ._trajectory import Stepper
@@ -32,7 +32,7 @@ class Outlook:
 
     Where no force disturbs the motion, it is the fitted trajectory; else a filter goes about the most probable path.
     Sigma points, as far apart as the start is uncertain, may lose either: about an eccentric orbit they were seen to
-    end four hundred times too far out.
+    end some five hundred times too far out.
     """
 
     stepper: Stepper
@@ -47,8 +47,8 @@ class Outlook:
         return self.stepper.problem.rows[self.recording]
 
     @cached_property
-    def _passed(self) -> tuple[Filtered, Smoothed]:
-        """Of filter and smoother, about the estimate's most probable path, or about its trajectory."""
+    def _filtered(self) -> tuple[Filtered, Slopes]:
+        """About the estimate's most probable path, or about its trajectory."""
         e, r, n = self.estimate, self.recording, self.rows.fitted
         path = self._trajectory[1][:n] if e.paths is None else e.paths[r]
         return filter_along(
@@ -93,13 +93,13 @@ class Outlook:
     @property
     def ok(self) -> bool:
         """Whether the filter, or the trajectory, went through the fitted rows."""
-        states = self._trajectory[1] if self._is_free else self._passed[0].filtered_means
+        states = self._trajectory[1] if self._is_free else self._filtered[0].filtered_means
         return bool(np.isfinite(states[: self.rows.fitted]).all())
 
-    @property
+    @cached_property
     def smoothed(self) -> Smoothed:
         """State and noises given all fitted rows."""
-        return self._passed[1]
+        return smooth(*self._filtered)
 
     @cached_property
     def last_state(self) -> Float[np.ndarray, " state"]:
@@ -107,7 +107,7 @@ class Outlook:
         filter failed."""
         last = self.rows.fitted - 1
         if self.ok and not self._is_free:
-            return np.asarray(self._passed[0].filtered_means[last])
+            return np.asarray(self._filtered[0].filtered_means[last])
         return self._trajectory[1][last]
 
     @cached_property
@@ -126,7 +126,8 @@ class Outlook:
     def run(self) -> Float[np.ndarray, "row channel"]:
         """Readings of the free run, from the last fitted row on."""
         last = self.rows.fitted - 1
-        return bent(self._run(self.last_state, last)[0], self.rows.times[last:], self.estimate.bends)
+        shown = self._trajectory[0][last:] if self._is_free else self._run(self.last_state, last)[0]
+        return bent(shown, self.rows.times[last:], self.estimate.bends)
 
     @cached_property
     def followed(self) -> Float[np.ndarray, "fitted channel"]:
@@ -134,7 +135,7 @@ class Outlook:
         if self._is_free:
             shown = self._trajectory[0][: self.rows.fitted]
         else:
-            shown = self.along(readings, np.asarray(self._passed[0].filtered_means[: self.rows.fitted]))
+            shown = self.along(readings, np.asarray(self._filtered[0].filtered_means[: self.rows.fitted]))
         return bent(shown, self.rows.times[: self.rows.fitted], self.estimate.bends)
 
     def along(self, what: What, states: Float[np.ndarray, "row state"]) -> np.ndarray:
@@ -149,7 +150,7 @@ class Outlook:
         if self._is_free:
             errors = (self.rows.readings - self.readings) / self._noise
             return np.where(np.isnan(self.rows.readings), 0.0, errors)[: self.rows.fitted]
-        return np.asarray(self._passed[0].standardised_innovations[: self.rows.fitted])
+        return np.asarray(self._filtered[0].standardised_innovations[: self.rows.fitted])
 
     def held_out_errors(self, times: np.ndarray, readings: np.ndarray) -> Float[np.ndarray, "row channel"]:
         """Readings minus the free run at original times after the last fitted row; NaN where nothing was read."""
@@ -172,7 +173,7 @@ class Outlook:
         """Variance of every reading when the unknowns are known: of the noise, and of what the filter cannot tell."""
         if self._is_free:
             return self._noise**2
-        S = np.asarray(self._passed[0].innovation_covariances[: len(self.rows.times)])
+        S = np.asarray(self._filtered[0].innovation_covariances[: len(self.rows.times)])
         return np.diagonal(S, axis1=1, axis2=2) / self._roots() ** 2
 
     def _unsure(self, inflation: float) -> Float[np.ndarray, "held channel"]:

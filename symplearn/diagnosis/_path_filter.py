@@ -6,20 +6,53 @@ pass of an iterated extended smoother, Bell 1994).
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from .._faults import Fault
-from .._filter import Filtered
+from .._filter import Filtered, unscented_filter
+from .._lane_loops import with_lane_loops
+from .._model import Gaussian, StateSpaceModel
 from .._smoother import Smoothed, smooth_along
 from ._path import linearise
 from ._problem import SLOTS, Combination
-from ._stochastic import MissingForce, exposure, free_run, padded, row_roots, softness
+from ._stochastic import MissingForce, RowNoise, exposure, free_run, padded, row_roots, softness
 from ._trajectory import Stepper
+
+
+class _Moved(eqx.Module):
+    """Deviations from a path over one span."""
+
+    def __call__(self, x: Array, span: tuple[Array, Array, Array]) -> Array:
+        defect, A, _ = span
+        return A @ x + defect
+
+
+class _Shown(eqx.Module):
+    """What deviations change of a row's readings."""
+
+    def __call__(self, x: Array, H: Array) -> Array:
+        return H @ x
+
+
+class _Added(eqx.Module):
+    """Process noise that is given for every span."""
+
+    def covariance(self, span: tuple[Array, Array, Array]) -> Array:
+        return span[2]
+
+
+class Slopes(NamedTuple):
+    """Slopes and noises along a path, which a smoother needs besides what the filter says."""
+
+    A: Float[Array, "interval state state"]
+    Q: Float[Array, "interval state state"]
+    H: Float[Array, "time channel state"]
+    R: Float[Array, "time channel channel"]
 
 
 def prolonged(
@@ -28,8 +61,7 @@ def prolonged(
     """A path of the leading rows that runs on freely over the others; where it diverges there, it stays."""
     last = len(path) - 1
     _, later = free_run(stepper.problem, stepper.courses[recording], z, combination, recording, path[last], last)
-    bad = ~np.isfinite(later).all(1)
-    later[bad] = path[last]
+    later[~np.isfinite(later).all(1)] = path[last]
     return np.concatenate([path[:last], later])
 
 
@@ -38,9 +70,10 @@ def filter_along(
     path: Float[np.ndarray, "time state"], noise: Float[np.ndarray, " channel"], ratio: Float[np.ndarray, " channel"],
     intensity: Float[np.ndarray, " d"], spread: Float[np.ndarray, "state state"],
     readings: Float[np.ndarray, "row channel"], exposures: Sequence[np.ndarray] | None = None,
-) -> tuple[Filtered, Smoothed]:  # fmt: skip
-    """Filter and smooth a recording about a path of all its rows, from the phase point in `z` with covariance `spread`;
-    the rest as for `run_filter`. Of the likelihood nothing is told.
+) -> tuple[Filtered, Slopes]:  # fmt: skip
+    """Filter a recording about a path of all its rows, from the phase point in `z` with covariance `spread`.
+
+    The rest as for `run_filter`.
     """
     problem, course = stepper.problem, stepper.courses[recording]
     length = course.times.shape[0]
@@ -55,42 +88,27 @@ def filter_along(
     force = MissingForce(jnp.asarray(intensity), jnp.asarray(soft), int(problem.equations.hidden))
     spans = jax.tree.map(lambda leaf: leaf[: length - 1], (course.spans, exposure(exposures, recording, length)))
     flow = linear.defect[0, :-1], linear.A[0, :-1]
-    read = linear.residual[0] * scale, linear.H[0] * scale[..., None], ~np.isnan(known)
+    read = np.where(np.isnan(known), np.nan, linear.residual[0] * scale), linear.H[0] * scale[..., None]
     first = z[recording * problem.state : (recording + 1) * problem.state] - path[0]
-    found, *slopes = _pass(force, noise**2, spans, flow, read, first, spread)
-    found = jax.tree.map(np.asarray, found)
-    moved = found.predicted_means + whole, found.filtered_means + whole
+    found, slopes = _filter(force, noise, spans, flow, read, first, spread)
+    moved = np.asarray(found.predicted_means) + whole, np.asarray(found.filtered_means) + whole
     found = eqx.tree_at(lambda one: (one.predicted_means, one.filtered_means), found, moved)
-    return found, jax.tree.map(np.asarray, _smooth(found, *slopes))
+    # As NumPy's: every part of JAX's that is looked at outside of compiled code is a program of its own.
+    return jax.tree.map(np.asarray, found), slopes
 
 
 @eqx.filter_jit
-def _pass(force, variance, spans, flow, read, first, spread):
-    """A Kalman filter of the deviations from the path; and its slopes and noises."""
-    (defect, A), (residual, H, observed) = flow, read
-    Q, R = jax.vmap(force.covariance)(spans), jnp.diag(variance)
-    seen = jnp.where(observed[..., None], H, 0.0)
+def _filter(force, noise, spans, flow, read, first, spread):
+    (defect, A), (residual, H) = flow, read
+    Q, rows = jax.vmap(force.covariance)(spans), RowNoise(noise**2)
+    model = StateSpaceModel(_Moved(), _Shown(), _Added(), rows, Gaussian(first, spread))
+    found = with_lane_loops(lambda y: unscented_filter(model, y, (defect, A, Q), H))(residual)
+    return found, Slopes(A, Q, H, jnp.broadcast_to(rows.covariance(None), (len(H), *[H.shape[1]] * 2)))
 
-    def step(carry, row):
-        m, P = carry
-        r, h, h_seen, is_seen, d, a, q = row
-        innovation = jnp.where(is_seen, r - h @ m, 0.0)
-        told, S = h_seen @ P @ h_seen.T + R, h @ P @ h.T + R
-        K = jnp.linalg.solve(told, h_seen @ P).T
-        m1, P1 = m + K @ innovation, P - K @ told @ K.T
-        standard = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(told), innovation, lower=True)
-        P1 = 0.5 * (P1 + P1.T)
-        return (d + a @ m1, a @ P1 @ a.T + q), (m, P, m1, P1, innovation, S, standard)
 
-    def lengthened(values):
-        return jnp.concatenate([values, jnp.zeros_like(values[:1])])
-
-    rows = (residual, H, seen, observed, *map(lengthened, (defect, A, Q)))
-    _, (before, prior, after, posterior, innovations, spreads, standard) = jax.lax.scan(step, (first, spread), rows)
-    nothing, fault = jnp.zeros(len(residual)), jnp.where(jnp.isfinite(after).all(), Fault.NONE, Fault.STATE)
-    found = Filtered(nothing.sum(), nothing, before, prior, after, posterior, innovations, spreads, standard, observed,
-                     fault, jnp.asarray(-1))  # fmt: skip
-    return found, A, Q, seen, jnp.broadcast_to(R, (len(residual), *R.shape))
+def smooth(found: Filtered, slopes: Slopes) -> Smoothed:
+    """Smooth what `filter_along` filtered."""
+    return jax.tree.map(np.asarray, _smooth(found, *slopes))
 
 
 _smooth = eqx.filter_jit(smooth_along)

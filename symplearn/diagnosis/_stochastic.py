@@ -51,7 +51,7 @@ class _Carried(eqx.Module):
         return self.inner(x, context[0])
 
 
-class _RowNoise(eqx.Module):
+class RowNoise(eqx.Module):
     """Reading noise; rows that average many readings are scaled to it beforehand."""
 
     variance: Float[Array, " channel"]
@@ -81,7 +81,7 @@ def filter_lane(
     """
     flow, read = model_at(equations, integrator, course, calibrated, coefficients)
     force, initial = MissingForce(intensity, soft, int(equations.hidden)), Gaussian(x, spread)
-    model = StateSpaceModel(_Carried(flow), _Scaled(read), force, _RowNoise(noise**2), initial)
+    model = StateSpaceModel(_Carried(flow), _Scaled(read), force, RowNoise(noise**2), initial)
     n = readings.shape[0]
     spans = jax.tree.map(lambda leaf: leaf[: n - 1], (course.spans, exposure))
     contexts = ((course.times[:n], course.inputs[:n]), roots)
