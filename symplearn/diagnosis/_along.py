@@ -53,12 +53,13 @@ def along(
     combination: Combination,
     states: Float[np.ndarray, "row state"],
 ) -> np.ndarray:
-    """One of the functions above at phase points of a recording's leading rows."""
+    """One of the functions above at phase points of a recording's leading rows; of its last row those beyond."""
     rows, n = problem.rows[recording], len(states)
     given = (problem.parameter_values(recording, z), problem.coefficients(recording, z, combination))
     # The last row is repeated up to the longest recording's length, so that one program serves all.
     every = np.minimum(np.arange(max(len(one.times) for one in problem.rows)), n - 1)
-    moving = (states[every], rows.inputs[every], rows.times[every])
+    row = np.minimum(every, len(rows.times) - 1)
+    moving = (states[every], rows.inputs[row], rows.times[row])
     return np.asarray(_mapped(problem.equations, what, *given, *moving))[:n]
 
 

@@ -1,5 +1,6 @@
 """Everything that is said about a finished search."""
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -50,8 +51,11 @@ _WAYS = {
 class Answer:
     """Everything that is said about a finished search."""
 
-    def __init__(self, file, recordings, stepper: Stepper, found: Found, options: Options, times: np.ndarray | None):
-        self.times = times
+    def __init__(
+        self, file, recordings, stepper: Stepper, found: Found, options: Options, times: np.ndarray | None,
+        notes: Sequence[str] = (),
+    ):  # fmt: skip
+        self.times, self.notes = times, notes
         self.file, self.recordings, self.stepper, self.found, self.options = file, recordings, stepper, found, options
         self.problem: Problem = stepper.problem
         self.posterior: Posterior = posterior(self.problem, found, 1.0)
@@ -157,7 +161,8 @@ class Answer:
             },
             "fit": {"before": before, "after": after},
             "next_measurement": self._next(),
-            "warnings": doubled(self.file)
+            "warnings": [*self.notes]
+            + doubled(self.file)
             + warnings(
                 self.problem,
                 self.recordings,
@@ -346,5 +351,8 @@ class Answer:
         """Readings to come, where they were asked for."""
         if self.times is None:
             return None
-        return forecast(self.stepper, self.recordings[0], self.before, self.run, self.times, self._spread(),
+        # What is missing was a force to the simulation as it is; one that errs by its sensor's memory alone claims to
+        # know how it goes on.
+        before = self.pull or self.before if self.chosen else self.before
+        return forecast(self.stepper, self.recordings[0], before, self.run, self.times, self._spread(),
                         self.options.seed)  # fmt: skip

@@ -15,6 +15,7 @@ from ._find import searched
 from ._forecast import forecast_times
 from ._options import Options
 from ._record import Diagnosis
+from ._turns import unwrapped
 
 _AS_USUAL = Options()
 
@@ -51,9 +52,10 @@ def _diagnosed(file: SimulationFile, recordings: Sequence[Recording], options: O
     begin = time.monotonic()
     options.progress("reading the equations of motion")
     times = _times_ahead(recordings[0], options)
+    recordings, notes = unwrapped(file, recordings)
     found, stepper = searched(file, recordings, options, begin + options.time_limit)
     options.progress("comparing before and after on the held-out rows")
-    answer = Answer(file, recordings, stepper, found, options, times)
+    answer = Answer(file, recordings, stepper, found, options, times, notes)
     return answer.diagnosis(time.monotonic() - begin)
 
 

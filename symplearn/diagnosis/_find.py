@@ -19,7 +19,7 @@ from ._problem import Problem
 from ._search import Search
 from ._start import first_fits, priors_without_effects
 from ._trajectory import Stepper
-from ._usable import check_fitted, check_motion, check_readings, check_searched, check_steps
+from ._usable import check_columns, check_fitted, check_motion, check_readings, check_searched, check_steps
 
 # Third differences show the noise and some of the motion: the share of them that counts as noise at least.
 _ROUGH = 0.3
@@ -43,6 +43,7 @@ def searched(
 
     problem = rebuild(substep)
     check_fitted(file, problem, options.holdout)
+    check_columns(file, problem)
     check_searched(problem, options.restriction)
     check_motion(file, problem)
     stepper = Stepper(problem, options.jobs)

@@ -72,7 +72,7 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     named_runs = max((one.score for c, one in found.ahead.items() if not _is_nameless(problem, c)), default=unseen)
     bare = found.of((), "white")
     least = -np.inf if bare is None else top + factor * (bare.log_evidence - top)
-    constant = top + factor * (constant_evidence(problem) - top)
+    constant = top + factor * (constant_evidence(problem, bare) - top)
     white, other, named = -np.inf, constant + np.log(remainder), []
     evidences: dict[Combination, float] = {}
     for combination, estimates in found.estimates.items():

@@ -18,6 +18,8 @@ from ._start import priors_without_effects
 _LARGEST = 1e100
 # Substeps that can be laid out in all, some hundred megabytes of times.
 _STEPS = 2e7
+# Readings beyond the unknown numbers with which a column tells its noise: an effect has up to so many numbers more.
+_MORE = 3
 # Starts at which the equations of motion are looked at together.
 _AT_ONCE = 3
 _SAID = {
@@ -60,6 +62,20 @@ def check_fitted(file: SimulationFile, problem: Problem, holdout: float) -> None
         raise InputError(
             f"--holdout: {holdout:g} leaves {rows} rows with readings for fitting, but {file.name} leaves {unknown} "
             "numbers unknown; hold out less, or give more rows"
+        )
+
+
+def check_columns(file: SimulationFile, problem: Problem) -> None:
+    """No column has so few readings, beside others that have enough, that a trajectory may go through every one of
+    them, and its noise be nothing. `InputError` otherwise."""
+    seen = np.array([(r.counts[: r.fitted] > 0).sum(0) for r in problem.rows])
+    enough = file.unknowns + file.unknown_states * (seen > 0).sum(0) + _MORE
+    few = seen.sum(0) < enough
+    for j in np.flatnonzero(few & np.isnan(problem.noise))[: 0 if few.all() else 1]:
+        column = shown(problem.equations.columns[j])
+        raise InputError(
+            f"{file.name}, [recording.observe] {column}: {seen[:, j].sum()} readings are left for fitting, too few "
+            f"to tell their noise; give {enough[j]}, give the noise in [recording.noise], or take the column out"
         )
 
 

@@ -19,6 +19,9 @@ REMAINDER = 0.3
 # How often white noise and the unknowns are found in turn at most, and the share of the former by which it still moves:
 # the likelihood is stationary in it, so that it is off by the square of that.
 _TURNS, _SETTLED = 6, 1e-5
+# The least share of the white noise that a remainder leaves of it in a channel that has no more readings than there are
+# numbers to fit: these may explain every one of them, and then no noise would be left.
+_LEAST = 1e-3
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,7 @@ class Estimate:
     modes: tuple[Mode, ...] = ()  # all optima that were found, this one among them
     outliers: tuple[tuple[float, float], ...] = ()  # share and size by channel, where they were left out
     promised: float = 0.0  # nats that the step to it is to bring, beside a remainder
+    log_likelihood: float = np.nan  # of the readings at `z`, of a trajectory fit
 
     @property
     def reading_noise(self) -> Float[np.ndarray, " channel"]:
@@ -104,6 +108,7 @@ def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -
                 value,
                 bool(fits.converged[b]),
                 variance_inflation(scores),
+                log_likelihood=float(offset[b] - 0.5 * square[b]),
             )  # fmt: skip
         )
     return out
@@ -182,6 +187,8 @@ def correlated(
     """
     combination, noise = fits.combinations[b], fits.noise[b].copy()
     free = np.isnan(problem.noise_of(combination))
+    fitted = int(problem.active(combination).sum()) + grams.shape[1] - 1 - problem.size
+    least = np.where(number > fitted, 0.0, _LEAST) * noise
     for _ in range(_TURNS):
         gram, follow, log = amplitudes_out((grams / (noise**2)[:, None, None]).sum(0), 1 + problem.size)
         offset = -0.5 * float((number * np.log(2 * np.pi * noise**2) + logs).sum() + log)
@@ -191,7 +198,8 @@ def correlated(
         column = np.concatenate([column, -follow @ column])
         square = np.einsum("i,jik,k->j", column, grams, column)
         before = noise
-        noise = np.where(free, np.sqrt(np.maximum(square, 1e-300) / np.maximum(number, 1)), noise)
+        found = np.sqrt(np.maximum(square, 1e-300) / np.maximum(number, 1))
+        noise = np.where(free, np.maximum(found, least), noise)
         if (np.abs(noise - before) <= _SETTLED * before).all():
             break
     # A step may be too small for the numbers it is added to: where a trajectory is that sensitive it ran away, and what
@@ -215,11 +223,15 @@ def amplitudes_out(
     gram: Float[np.ndarray, "column column"], kept: int
 ) -> tuple[Float[np.ndarray, "kept kept"], Float[np.ndarray, "rest kept"], float]:
     """A Gram matrix with the columns after the first `kept`, which enter with amplitudes of unit variance, integrated
-    out; how those amplitudes follow the others, and the log determinant that they leave."""
+    out; how those amplitudes follow the others, and the log determinant that they leave. NaN where no number tells."""
+    nothing = np.full((kept, kept), np.nan), np.zeros((len(gram) - kept, kept)), 0.0
     if not np.isfinite(gram).all():  # a trajectory that ran away
-        return np.full((kept, kept), np.nan), np.zeros((len(gram) - kept, kept)), 0.0
+        return nothing
     rest = gram[kept:, kept:] + np.eye(len(gram) - kept)
-    follow = np.linalg.solve(rest, gram[kept:, :kept])
+    try:
+        follow = np.linalg.solve(rest, gram[kept:, :kept])
+    except np.linalg.LinAlgError:  # a trajectory through every reading, beside which any amplitude is certain
+        return nothing
     return gram[:kept, :kept] - gram[:kept, kept:] @ follow, follow, float(np.linalg.slogdet(rest)[1])
 
 
