@@ -92,3 +92,37 @@ def test_a_reading_too_large_to_compute_with_is_refused(reading):
     none = cases.recorded(TIMES, np.full(60, np.nan), number=2)
     with pytest.raises(InputError, match=r"column `y0`: -?1e\+[13]0[01] is too large"):
         diagnose(swing(), [none, cases.recorded(TIMES, y)])
+
+
+def test_a_column_of_a_few_readings_tells_no_noise():
+    """Three speeds beside two hundred positions, two of them fitted: how many would do is said. With their noise given
+    they are used."""
+    times = np.linspace(0.0, 20.0, 200)
+    y = np.stack([np.cos(times), np.full(200, np.nan)], axis=1)
+    y[:, 0] += 0.01 * np.random.default_rng(1).normal(size=200)
+    y[[5, 50, 198], 1] = -np.sin(times[[5, 50, 198]])
+    observe = {"x": "q", "v": "p"}
+    recording = cases.recorded(times, y, columns=("x", "v"))
+    said = refusal(cases.simulation("p**2/2 + q**2/2", observe=observe), recording)
+    assert "`v`: 2 readings are left for fitting" in said and "give 5" in said
+    file = cases.simulation("p**2/2 + q**2/2", observe=observe, more="[recording.noise]\nv = 0.01\n")
+    only = Options(restriction=Restriction(("viscous_damping",)))
+    assert diagnose(file, [recording], only).document["verdict"] == "consistent"
+
+
+@pytest.mark.parametrize("rows", [3, 4])
+def test_a_few_rows_are_answered(rows):
+    """Nothing can be told of so few, and nothing is."""
+    times = np.linspace(0.0, 1.5, rows)
+    y = np.cos(2 * times) + 0.02 * np.random.default_rng(rows).normal(size=rows)
+    some = Options(restriction=Restriction(("viscous_damping", "linear_stiffness")))
+    assert diagnose(cases.simulation("p**2/2 + 2*q**2"), [cases.recorded(times, y)], some).document["findings"] == []
+
+
+def test_a_short_recording_may_stand_beside_a_long_one():
+    """Three rows beside two hundred, and inputs in both: they are answered together."""
+    long, short = np.linspace(0.0, 20.0, 200), np.linspace(0.0, 1.0, 3)
+    rng, only = np.random.default_rng(2), Options(restriction=Restriction(("viscous_damping",)))
+    both = [cases.recorded(t, np.cos(t) + 0.01 * rng.normal(size=len(t)), number=k + 1)
+            for k, t in enumerate((long, short))]  # fmt: skip
+    assert diagnose(cases.simulation("p**2/2 + q**2/2"), both, only).document["verdict"] == "consistent"

@@ -19,13 +19,18 @@ SWING = np.exp(-RATE * TIMES) * np.cos(TIMES)
 SPEED = np.gradient(SWING, TIMES)
 
 
-@pytest.fixture(scope="module")
-def known():
-    p = cases.problem(cases.simulation("p**2/2 + q**2/2"), [cases.recorded(TIMES, SWING)], 0.05)
+def along_the_swing(more=""):
+    """A problem, with priors along the swing."""
+    p = cases.problem(cases.simulation("p**2/2 + q**2/2", more=more), [cases.recorded(TIMES, SWING)], 0.05)
     z = np.zeros(p.size)
     still = np.zeros_like(TIMES)  # of the unseen oscillator, which there is none of
     motion = motion_along(p, z, [np.stack([SWING, still, SPEED, still], axis=1)])
     return p, with_effects(p, priors_without_effects(p), motion)
+
+
+@pytest.fixture(scope="module")
+def known():
+    return along_the_swing()
 
 
 def combined(p, values):
@@ -64,7 +69,7 @@ def test_what_loses_more_than_it_feeds_is_impossible(values, drives, known):
     owes nothing."""
     p, priors = known
     c, z = combined(p, values)
-    found = log_fed(p, c, priors, z, np.diag(np.full(p.size, 1e-6) ** 2))
+    found = log_fed(p, c, priors.powers, z, np.diag(np.full(p.size, 1e-6) ** 2))
     tenths = [surplus(values, part) for part in np.array_split(np.arange(len(TIMES)), 10)]
     # 1e-6: the log of a probability of one, of a surplus of hundreds of standard deviations.
     assert drives == (max(tenths) > 0) and (found == pytest.approx(0.0, abs=1e-6)) == drives
@@ -81,14 +86,45 @@ def test_what_is_uncertain_is_weighed_by_its_probability(known):
     spread[place, place] = 0.02**2
     # Both go with the speed's square, so that one more standard deviation of the damping balances them at any time: to
     # round-off, of which 1e-9 is ample.
-    assert log_fed(p, c, priors, z, spread) == pytest.approx(norm.logcdf(-1.0), abs=1e-9)
+    assert log_fed(p, c, priors.powers, z, spread) == pytest.approx(norm.logcdf(-1.0), abs=1e-9)
 
 
 def test_without_a_self_excitation_nothing_is_owed(known):
     """Dampings alone may only lose."""
     p, priors = known
     c, z = combined(p, {"coulomb_friction": [0.2], "viscous_damping": [0.1]})
-    assert log_fed(p, c, priors, z, np.eye(p.size)) == 0.0
+    assert log_fed(p, c, priors.powers, z, np.eye(p.size)) == 0.0
+
+
+KNOWN = {
+    "a damping": '[[terms]]\neffect = "viscous_damping"\ntarget = "q"\nc = 0.12\n',
+    "a force of the file": '[forces]\np = "-0.12*p"\n',
+    "dry friction": '[[terms]]\neffect = "coulomb_friction"\ntarget = "q"\nf = 0.2\n',
+}
+
+
+@pytest.mark.parametrize("more", KNOWN.values(), ids=KNOWN)
+def test_what_the_simulation_loses_counts(more):
+    """A self-excitation of 0.1 that the simulation's own losses outdo at any time only takes from these; one of 0.5
+    drives."""
+    p, priors = along_the_swing(more)
+    for c_, drives in ((0.1, False), (0.5, True)):
+        c, z = combined(p, {"self_excitation": [c_, 0.0]})
+        found = log_fed(p, c, priors.powers, z, np.diag(np.full(p.size, 1e-6) ** 2))
+        assert (found == pytest.approx(0.0, abs=1e-6)) == drives and (drives or found < -100)
+
+
+def test_a_damping_that_is_too_strong_is_told_beside_its_rivals():
+    """Twice the damping that there is: the finding takes a half of it back, though a self-excitation may be named."""
+    times = np.linspace(0.0, 20.0, 334)
+    y = cases.solved(lambda t, x: [x[1], -4 * x[0] - 0.05 * x[1]], [1.0, 0.0], times)[:, 0]
+    more = KNOWN["a damping"].replace("0.12", "0.10")
+    file = cases.simulation("p**2/2 + 2*q**2", more=more)
+    recording = cases.recorded(times, y + 0.01 * np.random.default_rng(1).normal(size=334))
+    only = Restriction(("viscous_damping", "self_excitation", "coulomb_friction"))
+    (found,) = diagnose(file, [recording], Options(restriction=only)).document["findings"]
+    low, high = found["coefficients"]["c"]["interval95"]
+    assert found["effect"] == "viscous_damping" and low < -0.05 < high
 
 
 @pytest.mark.slow

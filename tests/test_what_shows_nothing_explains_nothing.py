@@ -10,6 +10,7 @@ from scipy.stats import norm
 from symplearn.diagnosis import Options, Restriction, diagnose
 from symplearn.diagnosis._calibrate import THINNED
 from symplearn.diagnosis._constant import constant_evidence
+from symplearn.diagnosis._weighed import Estimate
 
 TIMES = np.linspace(0.0, 20.0, 80)
 
@@ -35,7 +36,7 @@ def test_constants_are_weighed_as_gaussians():
         for column, sd in zip(y.T, (None, given), strict=True):
             seen = column[~np.isnan(column)]
             expected += norm.logpdf(seen, seen.mean(), sd or seen.std()).sum() - 0.5 * np.log(len(seen))
-        assert constant_evidence(p) == pytest.approx(expected, rel=1e-12)
+        assert constant_evidence(p, None) == pytest.approx(expected, rel=1e-12)
 
 
 def test_a_row_of_averages_counts_as_one_with_less_noise():
@@ -46,14 +47,37 @@ def test_a_row_of_averages_counts_as_one_with_less_noise():
     for column, sd in zip(y.T, (0.1, 0.4), strict=True):
         seen = column[~np.isnan(column)]
         expected += norm.logpdf(seen, seen.mean(), sd / 2).sum() - 0.5 * np.log(len(seen))
-    assert constant_evidence(p) == pytest.approx(expected, rel=1e-12)
+    assert constant_evidence(p, None) == pytest.approx(expected, rel=1e-12)
 
 
 def test_a_sensor_that_stands_still_is_not_compared():
     """One value throughout tells no noise: nothing is then held against the simulation."""
     file = cases.simulation("p**2/2 + q**2/2", observe={"a": "q", "b": "p"})
     p = cases.problem(file, [cases.recorded(TIMES, np.stack([np.cos(TIMES), np.ones(80)], axis=1))], 0.05, 0.25)
-    assert constant_evidence(p) == -np.inf
+    assert constant_evidence(p, None) == -np.inf
+
+
+def test_constants_are_ahead_by_no_more_than_they_follow_the_readings():
+    """Of a simulation that follows them by three nats less, however much it owes for a start that is little known; of
+    one that follows them better, not at all."""
+    _, p = read()
+    bare = Estimate((), "white", np.zeros(1), np.zeros((1, 1)), np.ones(2), -500.0, True)
+    best = constant_evidence(p, None) + 0.5 * (np.log(60) + np.log(56))
+    assert constant_evidence(p, replace(bare, log_likelihood=best - 3.0)) == pytest.approx(-497.0, rel=1e-12)
+    assert constant_evidence(p, replace(bare, log_likelihood=best + 3.0)) == pytest.approx(-503.0, rel=1e-12)
+
+
+def test_a_piece_of_the_motion_is_no_mismatch():
+    """A tenth of a period, in a noise nearly as large as what is seen of it: consistent, though constants do as well,
+    which is said."""
+    times = np.linspace(0.0, 0.6, 24)
+    y = np.cos(times) + 0.1 * np.random.default_rng(5).normal(size=24)
+    file = cases.simulation("p**2/2 + q**2/2")
+    document = diagnose(
+        file, [cases.recorded(times, y)], Options(restriction=Restriction(("viscous_damping",)))
+    ).document
+    assert document["verdict"] == "consistent" and document["probability"] > 0.5
+    assert any("constants and noise tell the readings as well" in one for one in document["warnings"])
 
 
 def pendulum(start):

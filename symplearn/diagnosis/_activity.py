@@ -1,15 +1,18 @@
 """What a self-excitation feeds in, against what is lost beside it.
 
 Beside a friction, or far inside the motion, a self-excitation is one more law of damping: the two cancel but for what
-the law of friction lacks. That something drives the motion is seen only where more is fed in than is lost.
+the law of friction lacks. That something drives the motion is seen only where more is fed in than is lost, by frictions
+that are found and by those that the simulation has.
 """
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import log_ndtr
 
 from .._effects import EXCITATION, RELATIVE, Candidate, Drag
-from ._calibrate import Priors
 from ._motion import Motion
 from ._problem import Combination, Problem
 
@@ -19,9 +22,19 @@ _STRETCHES = 12
 _NEVER = -1e4
 
 
-def powers(problem: Problem, motion: Motion) -> tuple[Float[np.ndarray, "stretch value"], Int[np.ndarray, " stretch"]]:
-    """Mean power that each unit amplitude of a friction or an activity feeds in, by stretch of time along a motion, and
-    which recording each stretch is of."""
+@dataclass(frozen=True)
+class Powers:
+    """Mean powers along a motion by stretch of time: `fed`, what each unit amplitude of a friction or an activity feeds
+    in, and `known`, what the simulation's own feed into each coordinate. `recordings` tells which recording
+    each stretch is of."""
+
+    fed: Float[np.ndarray, "stretch value"]
+    known: Float[np.ndarray, "stretch d"]
+    recordings: Int[np.ndarray, " stretch"]
+
+
+def powers(problem: Problem, motion: Motion) -> Powers:
+    """Of stretches of a swing each, or as many as are looked at."""
     slowest = min(motion.own_frequency(i) for i in range(motion.q.shape[1]))
     rows, which, first = [], [], 0
     for r, times in enumerate(motion.times):
@@ -30,11 +43,15 @@ def powers(problem: Problem, motion: Motion) -> tuple[Float[np.ndarray, "stretch
             rows.append(first + part)
             which.append(r)
         first += len(times)
-    out = np.zeros((len(rows), problem.equations.size))
+    fed, known = np.zeros((len(rows), problem.equations.size)), _means(motion.turning, rows)
     for one in problem.equations.candidates:
         for k, power in enumerate(_power(motion, one)):
-            out[:, one.first + k] = [np.mean(power[part]) for part in rows]
-    return out, np.array(which)
+            fed[:, one.first + k] = _means(power, rows)
+    return Powers(fed, known, np.array(which))
+
+
+def _means(values: np.ndarray, rows: Sequence[np.ndarray]) -> np.ndarray:
+    return np.array([np.mean(values[part], axis=0) for part in rows])
 
 
 def _power(motion: Motion, one: Candidate) -> tuple[Float[np.ndarray, " row"], ...]:
@@ -51,28 +68,30 @@ def _power(motion: Motion, one: Candidate) -> tuple[Float[np.ndarray, " row"], .
 
 
 def log_fed(
-    problem: Problem, combination: Combination, priors: Priors, z: Float[np.ndarray, " z"],
+    problem: Problem, combination: Combination, by: Powers | None, z: Float[np.ndarray, " z"],
     covariance: Float[np.ndarray, "z z"],
 ) -> float:  # fmt: skip
     """Log probability that every self-excitation of a combination feeds in more than it and the frictions of its
-    coordinate take out, somewhere in the recordings; zero without any."""
+    coordinate, known and found, take out, somewhere in the recordings; zero without any."""
     ones = [m for m in combination if problem.candidate(m).effect is EXCITATION]
-    return float(sum(_log_fed(problem, combination, m, priors, z, covariance) for m in ones))
+    return 0.0 if by is None else float(sum(_log_fed(problem, combination, m, by, z, covariance) for m in ones))
 
 
-def _log_fed(problem: Problem, combination: Combination, member: int, priors: Priors, z, covariance) -> float:
-    own, fed = problem.members[member], np.zeros((len(priors.powers), len(z)))
+def _log_fed(problem: Problem, combination: Combination, member: int, by: Powers, z, covariance) -> float:
+    own = problem.members[member]
+    fed = np.zeros((len(by.fed), len(z)))
     for m, place in problem.placed(combination):
         one = problem.members[m]
         if _is_met(own.candidate, one.candidate):
             amplitudes = slice(one.candidate.first, one.candidate.first + one.candidate.effect.amplitudes)
-            acts = np.isin(priors.stretches, one.recordings)
+            acts = np.isin(by.recordings, one.recordings)
             entries = slice(place.start, place.start + one.candidate.effect.amplitudes)
-            fed[:, entries] = np.where(acts[:, None], priors.powers[:, amplitudes], 0.0)
-    fed = fed[np.isin(priors.stretches, own.recordings)]
+            fed[:, entries] = np.where(acts[:, None], by.fed[:, amplitudes], 0.0)
+    some = np.isin(by.recordings, own.recordings)
+    fed, known = fed[some], by.known[some, own.candidate.place]
     with np.errstate(all="ignore"):  # what ran away says nothing
         sd = np.sqrt(np.maximum(np.einsum("wi,ij,wj->w", fed, covariance, fed), 0.0))
-        surplus = fed @ z / np.maximum(sd, 1e-300)
+        surplus = (fed @ z + known) / np.maximum(sd, 1e-300)
     surplus = surplus[np.isfinite(surplus)]
     return max(float(log_ndtr(surplus.max())), _NEVER) if len(surplus) else 0.0
 

@@ -1,10 +1,11 @@
 """Trajectory fits of many combinations at once: Levenberg-Marquardt on readings and priors, in a growing window."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from ._problem import Combination, Problem
 from ._trajectory import Predictions, Stepper
@@ -41,8 +42,7 @@ class Priors:
     lower: Float[np.ndarray, " coefficient"]
     upper: Float[np.ndarray, " coefficient"]
     unseen: Float[np.ndarray, "2"]
-    powers: Float[np.ndarray, "stretch value"] = field(default_factory=lambda: np.zeros((0, 0)))  # see `_activity`
-    stretches: Int[np.ndarray, " stretch"] = field(default_factory=lambda: np.zeros(0, int))
+    powers: Any = None  # `Powers` of the frictions along the motion
 
     def widths(self, problem: Problem) -> Float[np.ndarray, " parameter"]:
         """Standard deviations of the calibrated parameters; 0 where nothing gives a size."""

@@ -44,9 +44,8 @@ def with_effects(problem: Problem, priors: Priors, motion: Motion) -> Priors:
     scales = np.where(np.isfinite(scales) & (scales > 0), scales, 1.0)
     starts = [_unseen(motion, i, _looseness(problem, priors, motion, i)) for i in range(problem.equations.declared)]
     unseen = np.array(max(starts))
-    fed, stretches = powers(problem, motion)
-    return replace(priors, centres=centres, scales=scales, lower=lower, upper=upper, unseen=unseen, powers=fed,
-                   stretches=stretches)  # fmt: skip
+    return replace(priors, centres=centres, scales=scales, lower=lower, upper=upper, unseen=unseen,
+                   powers=powers(problem, motion))  # fmt: skip
 
 
 def _looseness(problem: Problem, priors: Priors, motion: Motion, i: int) -> float:

@@ -137,8 +137,8 @@ class Regression:
         spread = inverse(square + np.diag(1.0 + _ROUND_OFF * np.diag(square)))
         push = (self.error @ self.gram[:, a]) * unit
         sizes = spread @ push
-        signed = np.isin(a, [self.where[k][0] for k in chosen if self._is_positive(k)])
-        if not np.isfinite(sizes).all() or (sizes[signed] < 0).any():
+        first = np.isin(a, [self.where[k][0] for k in chosen if len(self.where[k])])
+        if not np.isfinite(sizes).all() or (sizes < self._lowest(chosen))[first].any():
             return None
         gain = 0.5 * float(push @ sizes) + 0.5 * float(np.linalg.slogdet(spread)[1]) if len(a) else 0.0
         return Subset(chosen, sizes, spread, gain)
@@ -149,11 +149,13 @@ class Regression:
         if not some:
             return 0.0
         own = np.repeat(np.arange(len(some)), [len(self.where[k]) for k in some])
-        lowest = np.array([0.0 if self._is_positive(k) else -np.inf for k in some])[own]
-        return mixture_gain(subset.sizes, subset.spread, own, lowest)
+        return mixture_gain(subset.sizes, subset.spread, own, self._lowest(some))
 
-    def _is_positive(self, k: int) -> bool:
-        return self.problem.candidate(self.responses[k].member).effect.positive
+    def _lowest(self, chosen: Sequence[int]) -> Float[np.ndarray, " amplitude"]:
+        """Below which sizes the amplitudes of some effects are not physical."""
+        bounds = [self.problem.lowest(self.responses[k].member) / self.width[self.where[k]]
+                  for k in chosen if len(self.where[k])]  # fmt: skip
+        return np.concatenate([np.zeros(0), *bounds])
 
     def _begin(self, subset: Subset) -> Float[np.ndarray, " z"]:
         """Where the regression puts all unknowns."""

@@ -40,6 +40,8 @@ class Motion:
     forces: Float[np.ndarray, " d"]  # root mean square
     levels: Float[np.ndarray, " channel"]  # root mean square of the expected readings
     times: tuple[Float[np.ndarray, " _"], ...]  # by recording
+    # Power that forces which turn round with the motion feed into each coordinate, by row.
+    turning: Float[np.ndarray, "row d"]
     # What the stiffness of each coordinate changes by, per unit of each calibrated parameter.
     stiffening: Float[np.ndarray, "d parameter"] = field(default_factory=lambda: np.zeros((1, 0)))
 
@@ -74,6 +76,8 @@ def motion_along(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarr
     """The motion along given paths."""
     d = problem.equations.dim
     v, push, each, shown = (along_all(problem, what, z, paths) for what in (velocity, force, parts, readings))
+    back = [np.where(np.arange(path.shape[1]) < problem.equations.width, path, -path) for path in paths]
+    turning = 0.5 * (push - along_all(problem, force, z, back))[:, :d] * v[:, :d]
     p, span = np.concatenate(paths)[:, problem.equations.momentum], max(np.ptp(r.times) for r in problem.rows)
     own = [each[:, np.equal(problem.equations.pushed, i)] for i in range(d)]
     return Motion(
@@ -82,6 +86,7 @@ def motion_along(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarr
         forces=np.array([_there(push[:, i], own[i], rms(p[:, i]) / span) for i in range(d)]),
         levels=np.array([rms(column) for column in shown.T]),
         times=tuple(r.times[: len(path)] for r, path in zip(problem.rows, paths, strict=True)),
+        turning=turning,
         stiffening=stiffening(problem, z, paths),
     )
 

@@ -234,9 +234,16 @@ class Problem:
 
     def lower_bounds(self, combination: Sequence[int]) -> dict[int, float]:
         """Entries of z that are physical above a bound only: a drag adds up to at least nothing with its known term."""
-        signed = [(m, place) for m, place in self.placed(combination) if self.candidate(m).effect.positive]
         return {
-            place.start + k: -float(self.terms[:, self.candidate(m).first + k].min())
-            for m, place in signed
-            for k in range(self.candidate(m).effect.amplitudes)
+            place.start + k: float(low)
+            for m, place in self.placed(combination)
+            if self.candidate(m).effect.positive
+            for k, low in enumerate(self.lowest(m))
         }
+
+    def lowest(self, member: int) -> Float[np.ndarray, " amplitude"]:
+        """Below which value each amplitude of an effect is not physical."""
+        one = self.candidate(member)
+        number = one.effect.amplitudes
+        known = self.terms[:, one.first : one.first + number].min(0)
+        return -known if one.effect.positive else np.full(number, -np.inf)

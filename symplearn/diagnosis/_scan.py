@@ -223,11 +223,13 @@ def _scored(
     priors: Priors, others: Nuisance,
 ) -> list[Score]:  # fmt: skip
     """Scores in the order of the responses, like ones together; some are known."""
-    alike: dict[tuple[int, bool], list[int]] = {}
+    alike: dict[tuple[int, bool, int | None], list[int]] = {}
     for k, told in enumerate(tried):
         if k not in own:
-            effect = problem.candidate(told.member).effect
-            alike.setdefault((effect.amplitudes, effect.positive), []).append(k)
+            candidate = problem.candidate(told.member)
+            effect, first = candidate.effect, candidate.first
+            known = first if problem.terms[:, first : first + effect.amplitudes].any() else None
+            alike.setdefault((effect.amplitudes, effect.positive, known), []).append(k)
     found = dict(own)
     for some in alike.values():
         found |= zip(some, scores(problem, [tried[k] for k in some], z, priors, others), strict=True)

@@ -161,8 +161,8 @@ class Score(NamedTuple):
 def scores(
     problem: Problem, responses: Sequence[Response], z: Float[np.ndarray, " z"], priors: Priors, others: Nuisance
 ) -> list[Score | None]:
-    """The score of every response, of effects that have as many amplitudes and the same signs, or of one unseen
-    oscillator; None where there is no step."""
+    """The score of every response, of effects that have as many amplitudes and are bounded alike in units of their
+    scales, or of one unseen oscillator; None where there is no step."""
     ones = [problem.candidate(one.member) for one in responses]
     effect, number = ones[0].effect, ones[0].effect.amplitudes
     scales = np.stack([priors.scales[one.first : one.first + number] for one in ones])
@@ -174,10 +174,9 @@ def scores(
     spread = inverse(square - cross.mT @ after + held[:, :, None] * np.eye(number))
     push = vector - (after * others.vector[:, :, None]).sum(1)
     amplitudes = np.einsum("lab,lb->la", spread, push)
-    sound = np.isfinite(amplitudes).all(1) & ~(effect.positive & (amplitudes[:, 0] < 0))
-    lowest = np.full(number, -np.inf)
-    if effect.positive:
-        amplitudes, lowest = np.maximum(amplitudes, 0.0), np.zeros(number)
+    lowest = problem.lowest(responses[0].member)
+    sound = np.isfinite(amplitudes).all(1) & (amplitudes[:, 0] >= lowest[0])
+    amplitudes = np.maximum(amplitudes, lowest)
     gains = others.gain + 0.5 * (push * amplitudes).sum(1) + 0.5 * np.linalg.slogdet(spread)[1] - np.log(scales).sum(1)
     steps = others.step - np.einsum("lza,la->lz", after, amplitudes)
     if effect.switched:
@@ -185,7 +184,7 @@ def scores(
         gains += _unseen_strengths(problem, member, priors, others, after, amplitudes, spread, steps)
     else:
         shape = scales[:, :, None] * scales[:, None, :]
-        gains += mixture_gains(amplitudes / scales, spread / shape, np.zeros(number, int), lowest)
+        gains += mixture_gains(amplitudes / scales, spread / shape, np.zeros(number, int), lowest / scales[0])
     moved = np.repeat(z[None], len(ones), axis=0)
     moved[:, others.active] += steps
     moved = np.clip(moved, *others.bounds)

@@ -52,7 +52,7 @@ def strength_gain(
 ) -> float:  # fmt: skip
     """Log evidence under unknown orders of magnitude, less that under the widest priors, whose posterior is given; and
     of a self-excitation what is fed in."""
-    total, blocks = log_fed(problem, combination, priors, z, covariance), []
+    total, blocks = log_fed(problem, combination, priors.powers, z, covariance), []
     alone = sum(problem.candidate(member).effect.amplitudes > 0 for member in combination) == 1
     for member in combination:
         entries = strength_entries(problem, combination, member)

@@ -68,12 +68,16 @@ def _slope(file: SimulationFile, tree: sympy.Expr, angle: sympy.Symbol) -> float
 def _is_cyclic(file: SimulationFile, coordinate: str) -> bool:
     """Whether whole turns of a coordinate change nothing that moves it."""
     q = symbol(coordinate)
-    some = [file.hamiltonian.tree, *(one.tree for one in file.forces.values())]
-    some += [term.expression.tree for term in file.terms if term.expression is not None]
     if any(term.effect.endswith("stiffness") and coordinate in term.target for term in file.terms):
         return False
-    differences = [sympy.diff(one.subs(q, q + 2 * sympy.pi) - one, s) for one in some for s in one.free_symbols]
-    return all(_is_nothing(one) for one in differences)
+
+    def changed(tree: sympy.Expr) -> sympy.Expr:
+        return tree.subs(q, q + 2 * sympy.pi) - tree
+
+    pushes = [*file.forces.values(), *(term.expression for term in file.terms if term.expression is not None)]
+    energy = changed(file.hamiltonian.tree)  # of which a constant moves nothing
+    moved = [sympy.diff(energy, symbol(name)) for name in file.states]
+    return all(_is_nothing(one) for one in [*moved, *(changed(push.tree) for push in pushes)])
 
 
 def _is_nothing(tree: sympy.Expr) -> bool:
