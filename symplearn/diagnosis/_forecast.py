@@ -86,7 +86,7 @@ def _expected(
     if e.intensity is None:
         zs, ends, log_weights = _by_all_rows(stepper, e, root, units)
     else:
-        zs = jnp.asarray(_within(stepper.problem, e.z[stepper.problem.local(0)] + units @ root.T))
+        zs = jnp.asarray(_within(stepper.problem, e.z[stepper.problem.local(0)] + units @ root.T, root))
         ends, log_weights = _filtered(stepper, e, zs, state_key), np.zeros(len(units))
     # A force that has acted for a while is over.
     pushed = jnp.asarray(intensity_of(stepper, e) * (e.exposures is None))
@@ -114,7 +114,7 @@ def _by_all_rows(
     """Draws given all rows, their phase points at the last one, and log weights; the first is the most probable one."""
     problem, rows = stepper.problem, stepper.problem.rows[0]
     known = taught(stepper, e, root)
-    zs = jnp.asarray(_within(problem, known.mean + units @ known.root.T))
+    zs = jnp.asarray(_within(problem, known.mean + units @ known.root.T, known.root))
     seen, states = _run_through(*_model(stepper), zs, jnp.asarray(problem.onehot(e.combination, 0)))
     shown = bent(np.asarray(seen)[:, : len(rows.times)], rows.times, e.bends)
     return zs, states[:, len(rows.times) - 1], known.log_weights(units, shown, rows.readings)
@@ -173,10 +173,17 @@ def _summary(
     return centre, np.sqrt(np.einsum("dt,dtc->tc", shares, (values - centre) ** 2))
 
 
-def _within(problem: Problem, zs: np.ndarray) -> np.ndarray:
-    """Draws inside the bounds of the calibrated values."""
-    part = slice(problem.state, problem.state + problem.calibrated.size)
-    zs[:, part] = np.clip(zs[:, part], problem.calibrated.lower, problem.calibrated.upper)
+def _within(
+    problem: Problem, zs: Float[np.ndarray, "draw local"], root: Float[np.ndarray, "local local"]
+) -> Float[np.ndarray, "draw local"]:
+    """Draws inside the bounds of the calibrated values; all else follows a value that is moved to its bound."""
+    c, spread = problem.calibrated, root @ root.T
+    for k, low, high in zip(range(problem.state, problem.state + c.size), c.lower, c.upper, strict=True):
+        moved = np.clip(zs[:, k], low, high) - zs[:, k]
+        if moved.any() and spread[k, k] > 0:
+            zs = zs + moved[:, None] * (spread[k] / spread[k, k])
+    part = slice(problem.state, problem.state + c.size)
+    zs[:, part] = np.clip(zs[:, part], c.lower, c.upper)  # what follows one may leave its own
     return zs
 
 

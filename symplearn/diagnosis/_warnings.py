@@ -26,6 +26,8 @@ _FAR = 10.0
 # Held-out errors of this many times what is expected are no chance: a free run's are of one piece, as two readings,
 # whose mean square is above nine once in eight thousand times.
 _MISSED = 3.0
+# A value is at its bound that is within this share of its standard deviation, unless the bound is nothing beside it.
+_AT, _NOTHING = 0.01, 1e-6
 # Held-out errors that grow by less than this are as large as before.
 _WORSE = 1.1
 
@@ -83,6 +85,7 @@ def warnings(
     out += [f"recordings {a} and {b} hold the same numbers: what they show counts twice" for a, b in _same(recordings)]
     if not found.complete:
         out.append("the time limit was reached before every combination was weighed")
+    out += at_bounds(problem, after) + stuck(recordings)
     for j, name in enumerate(c.names):
         moved = abs(after.z[problem.head + j] - c.mean[j]) / c.sd[j]
         if moved > 3:
@@ -102,6 +105,31 @@ def warnings(
         out.append(f"evidence was discounted by a factor of {1 / odds.tempered:.1f}: "
                    "the remainder is not white on the scale of the motion")  # fmt: skip
     return out
+
+
+def at_bounds(problem: Problem, after: Estimate) -> list[str]:
+    """Which calibrated values the readings would have beyond a bound that is given; zero is no other."""
+    c, out = problem.calibrated, []
+    for j, name in enumerate(c.names):
+        k = problem.head + j
+        z, near = float(after.z[k]), _AT * float(np.sqrt(after.covariance[k, k]))
+        for bound, beyond in ((c.lower[j], z <= c.lower[j] + near), (c.upper[j], z >= c.upper[j] - near)):
+            if np.isfinite(bound) and abs(bound) > _NOTHING * abs(c.mean[j]) and beyond:
+                out.append(f"{name} is at its bound, {bound:g}: the readings would have it beyond, and what is found "
+                           "may stand in for that; widen the bound if it may be")  # fmt: skip
+    return out
+
+
+def stuck(recordings: Sequence[Recording]) -> list[str]:
+    """Which columns read one value throughout, beside others that do not."""
+    every = np.concatenate([r.readings for r in recordings])
+    still = [np.ptp(column[~np.isnan(column)]) == 0 for column in every.T]
+    return [
+        f"{name} reads {column[~np.isnan(column)][0]:g} in every row: a sensor that is stuck shows nothing of the "
+        "motion and misleads; take the column out of [recording.observe] unless it is right"
+        for name, column, same in zip(recordings[0].columns, every.T, still, strict=True)
+        if same and not all(still)
+    ]
 
 
 def set_back(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
