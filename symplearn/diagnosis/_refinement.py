@@ -11,6 +11,7 @@ from ._clocks import share_clocks, weigh_later_clocks
 from ._depths import along_the_depths
 from ._driven import as_driven
 from ._found import Found, speaker
+from ._gaps import across_gaps
 from ._modes import along_the_modes
 from ._problem import MOST, Combination, Problem
 from ._prospects import MANY, Prospects
@@ -80,6 +81,13 @@ class Refinement:
         if starts or driven:
             self.progress("moving stiffness between what is seen and what is not")
             self.weigher.weigh([*starts, *driven], whole=True)
+
+    def cross_gaps(self, size: int) -> None:
+        """Try the best of a size from where fits lead that were found gap by gap."""
+        some = [self.weigher.base] if size == 0 else self._near(size)[:_MOVED]
+        if starts := [start for c in some if (start := across_gaps(self.weigher, c))]:
+            self.progress("crossing the gaps once more")
+            self.weigher.weigh(starts, whole=True)
 
     def _near(self, size: int) -> list[Combination]:
         """The best of a size, and those not far behind it."""

@@ -7,8 +7,6 @@ import numpy as np
 from ._clocks import share_clocks, weigh_clocks
 from ._found import Found
 from ._problem import MOST, Combination
-from ._score import Start
-from ._weighed import Estimate
 from ._weigher import KEPT, Weigher
 
 # Combinations this many nats behind the best are tried beside a remainder.
@@ -19,8 +17,6 @@ _SIMPLE = 2
 # tried beside it, and beside a clock, where that explains more than this many nats.
 _BEST, _STATIC = 24, 8
 _LATER, _CLOCKS, _WORTH = 64, 16, 2.0
-# Standard deviations of a trajectory fit beyond which another point may belong to another optimum.
-_ELSEWHERE = 3.0
 
 
 class Remainders:
@@ -59,22 +55,6 @@ class Remainders:
         white = {c: self._odds(c, "white") for c in ranked if c}
         if later := self._lifted(first, white, "static")[:_LATER]:
             self.weigher.weigh_static(later)
-        self._fit_from_there()
-
-    def _fit_from_there(self) -> None:
-        """The likeliest once more from where such a force puts them, if that is far: after a long gap a trajectory fit
-        may be caught a swing off, and the force makes that good."""
-        found, tried = self.found, list[Start]()
-        for c in self._ranked()[:KEPT]:
-            white, static = found.of(c, "white"), found.of(c, "static")
-            if white and static and static.log_evidence > white.log_evidence + _WORTH and _is_elsewhere(white, static):
-                tried.append(Start(c, static.z, 0.0))
-        if not tried:
-            return
-        before = {one.combination: self._odds(one.combination, "white") for one in tried}
-        self.weigher.weigh(tried, whole=True)
-        if better := [c for c, old in before.items() if self._odds(c, "white") > old + _WORTH]:
-            self.weigher.weigh_static(better)
 
     def _lifted(
         self, first: Sequence[Combination], before: Mapping[Combination, float], kind: str
@@ -97,9 +77,3 @@ class Remainders:
         """The best of each size, outliers that are taken out aside."""
         sizes = [len(self.weigher.base) + size for size in range(1, MOST)]
         return [c for size in sizes for c in [c for c in self._ranked() if len(c) == size][:most]]
-
-
-def _is_elsewhere(white: Estimate, other: Estimate) -> bool:
-    """Whether an estimate lies beyond what a trajectory fit allows."""
-    sd = np.sqrt(np.diagonal(white.covariance))
-    return bool(np.any(np.abs(other.z - white.z) > _ELSEWHERE * np.where(sd > 0, sd, np.inf)))

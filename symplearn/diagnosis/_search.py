@@ -76,6 +76,7 @@ class Search:
     def run(self) -> Found:
         """Search, smallest combinations first."""
         self.beginning.run()
+        self.refinement.cross_gaps(0)
         for size in range(1, MOST - len(self.base) + 1):
             if size > 1 and not self.in_time():
                 break
@@ -88,6 +89,7 @@ class Search:
                 break
             if self.in_time():
                 self.refinement.move_modes(size)
+                self.refinement.cross_gaps(size)
             if size > 1 and not self._gained(size):
                 break
         self._refine()

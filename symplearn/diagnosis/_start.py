@@ -106,7 +106,7 @@ def _tried(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Float[np.nd
     predictions = stepper.predict(drawn, [()] * len(drawn), rows)
     half = _TRIED // 2
     side_by_side = [(k,) * len(rows) for k in range(half)]
-    orders = [order for order, _ in _ranked(stepper.problem, predictions, rows)]
+    orders = [order for order, _ in ranked(stepper.problem, predictions, rows)]
     best = _joined(stepper.problem, drawn, orders, side_by_side)
     return np.concatenate([best, drawn[:half]])
 
@@ -168,7 +168,7 @@ def _recombined(
     belong together.
     """
     orders, apart = [], []
-    for r, (order, misfit) in enumerate(_ranked(problem, predictions, rows)):
+    for r, (order, misfit) in enumerate(ranked(problem, predictions, rows)):
         near = int((misfit[order] <= misfit[order[0]] + 2 * _HOPELESS).sum())
         first, others = _apart_first(lanes[order, r * problem.state : (r + 1) * problem.state], near)
         orders.append(order[[*first, *others]])
@@ -176,7 +176,7 @@ def _recombined(
     return _joined(problem, lanes, orders, _ranks(apart, len(lanes)))
 
 
-def _ranked(
+def ranked(
     problem: Problem, predictions: list[Predictions], rows: Sequence[int]
 ) -> list[tuple[Int[np.ndarray, " lane"], Float[np.ndarray, " lane"]]]:
     """Lanes of every recording, those that follow it best first, and minus twice the profile likelihood of each."""

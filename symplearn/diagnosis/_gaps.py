@@ -1,0 +1,86 @@
+"""Fits across gaps in which the motion goes round often.
+
+What the rows before a gap leave open of the motion's pace may be several swings behind it, and a fit that goes on with
+the rows there is caught at the swing that is nearest. So many are drawn of what the rows before leave open, and those
+go on that follow the next rows best.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from ._calibrate import Fits, calibrate
+from ._problem import Combination, Problem
+from ._score import Start
+from ._start import ranked
+from ._weighed import weigh_white
+from ._weigher import Weigher
+
+# Rows that were left empty one after the other, as many as make a gap.
+_LONG = 10
+# Draws, and those that are fitted; how many times as wide as the rows before leave open.
+_DRAWN, _KEPT, _WIDTHS = 128, 8, (0.5, 1.0, 2.0)
+# Rows behind a gap that draws are to follow; the share of the readings' spread by which draws scatter there from which
+# on they may be swings apart.
+_NEXT, _OPEN = 16, 0.3
+_STEPS = 20
+
+
+def across_gaps(weigher: Weigher, combination: Combination) -> Start | None:
+    """Where a fit of a combination begins that was found gap by gap, None where no gap leaves a swing open."""
+    problem, white = weigher.problem, weigher.found.of(combination, "white")
+    if white is None or not np.isfinite(white.log_evidence):
+        return None
+    z, is_open = white.z, False
+    for r, end, begin, later in _gaps(problem, weigher.rows):
+        rows = [end if k == r else n for k, n in enumerate(weigher.rows)]
+        drawn = _drawn(weigher, combination, z, rows)
+        more = [min(begin + _NEXT, later) if k == r else n for k, n in enumerate(weigher.rows)]
+        predictions = weigher.stepper.predict(drawn, [combination] * len(drawn), more)
+        spread = np.nanstd(problem.rows[r].readings, axis=0)
+        behind = predictions[r].readings[:, begin : more[r]]
+        if not np.nanmax(np.nanstd(np.where(np.isfinite(behind), behind, np.nan), axis=0) / spread) > _OPEN:
+            continue
+        is_open = True
+        misfit = sum(value for _, value in ranked(problem, predictions, more))
+        some = drawn[np.argsort(misfit)[:_KEPT]]
+        # As far as to the next gap: beyond it swings are open again.
+        window = [later if k == r else n for k, n in enumerate(weigher.rows)]
+        for part in (more, window):
+            fits = calibrate(weigher.stepper, some, [combination] * len(some), weigher.found.priors, part, _STEPS)
+            some = fits.z
+        z = fits.z[_best(weigher, fits, window)]
+    return Start(combination, z, 0.0) if is_open else None
+
+
+def _gaps(problem: Problem, rows: list[int]) -> Iterator[tuple[int, int, int, int]]:
+    """Recordings with the rows at which a gap begins and ends, and at which the next one begins."""
+    for r, (one, n) in enumerate(zip(problem.rows, rows, strict=True)):
+        seen = np.flatnonzero((one.counts[:n] > 0).any(1))
+        wide = np.flatnonzero(np.diff(seen) > _LONG)
+        ends = [*(int(seen[k]) + 1 for k in wide), n]
+        for k, (end, later) in zip(wide, zip(ends[:-1], ends[1:], strict=True), strict=True):
+            yield r, end, int(seen[k + 1]), later
+
+
+def _drawn(
+    weigher: Weigher, combination: Combination, z: Float[np.ndarray, " z"], rows: list[int]
+) -> Float[np.ndarray, "lane z"]:
+    """Draws of what some rows leave open about a fit to them."""
+    problem, priors = weigher.problem, weigher.found.priors
+    fits = calibrate(weigher.stepper, z[None], [combination], priors, rows, _STEPS)
+    (one,) = weigh_white(problem, replace(fits, converged=np.ones(1, bool)), priors, rows)
+    values, vectors = np.linalg.eigh(one.covariance)
+    rng = np.random.default_rng(0)
+    units = rng.choice(_WIDTHS, (_DRAWN, 1)) * rng.normal(size=(_DRAWN, len(z)))
+    units[0] = 0.0
+    found = one.z + (units * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return np.clip(found, *priors.bounds_of(problem, combination))
+
+
+def _best(weigher: Weigher, fits: Fits, rows: list[int]) -> int:
+    fits = replace(fits, converged=np.ones(len(fits.z), bool))
+    values = [one.log_evidence for one in weigh_white(weigher.problem, fits, weigher.found.priors, rows)]
+    return int(np.argmax(np.where(np.isnan(values), -np.inf, values)))
