@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from ._motion import extent, motion_along
 from ._noisy import PathFit, fit_paths
 from ._null_paths import null_paths
 from ._score import Start
+from ._sizes import is_read
 from ._start import with_states
 from ._stochastic import trajectories
 from ._weigher import Weigher
@@ -99,6 +101,14 @@ class Beginning:
     def best(self) -> PathFit:
         """The best path of the simulation without effects."""
         return max(self.paths, key=lambda fit: fit.log_evidence)
+
+    @cached_property
+    def unread(self) -> list[int]:
+        """Coordinates of which no recording reads anything, be it their speed."""
+        problem, mean = self.weigher.problem, self.weigher.found.priors.mean
+        read = np.any([is_read(problem, mean, r) for r in range(len(problem.rows))], axis=0)
+        width = problem.equations.width
+        return [i for i in range(problem.equations.declared) if not (read[i] or read[width + i])]
 
     def from_seed(self) -> np.ndarray:
         """Where a fit begins that knows nothing better."""

@@ -106,7 +106,7 @@ def fitted(
     of the columns."""
     known = problem.noise[j]
     some = [one.middle(column) for one, column in zip(pieces, left, strict=True)]
-    grid = grid_of([one.times for one in pieces], _DAMPINGS, _TIMES)
+    grid = grid_of([one.times for one in pieces], not np.isnan(known), _DAMPINGS, _TIMES)
     largest = REMAINDER * float(np.nanstd(np.concatenate([r.readings[:, j] for r in problem.rows])))
     both = list(begins[0])
     if len(begins) > 1:  # filled up to the grid's number of points, whose program is compiled already

@@ -23,6 +23,8 @@ from .._lane_loops import with_lane_loops
 RATIOS = np.geomspace(0.03, 1e6, 12)
 _DAMPINGS = (30.0, 1.001, 0.3, 0.1)
 _TIMES = 10
+# Gaps that an error lasts at least where the noise is given: a shorter memory would be a noise that is wrongly given.
+_LASTING = 3.0
 # Rows that the grid is searched with; more would not tell the colour better.
 MOST_ROWS = 4000
 # Lanes whitened together.
@@ -170,10 +172,14 @@ def _wide(values: np.ndarray, width: int) -> np.ndarray:
     return out
 
 
-def grid_of(times: list[np.ndarray], dampings: Sequence[float] = _DAMPINGS, number: int = _TIMES) -> np.ndarray:
-    """Every (ratio, frequency, damping) that is tried: so many memories from one gap to a quarter of the recording."""
+def grid_of(
+    times: list[np.ndarray], is_given: bool, dampings: Sequence[float] = _DAMPINGS, number: int = _TIMES
+) -> np.ndarray:
+    """Every (ratio, frequency, damping) that is tried: so many memories from one gap to a quarter of the recording, or
+    from a few gaps where the noise is given."""
     gap = min(float(np.median(np.diff(t))) for t in times)
-    memories = np.geomspace(gap, max(t[-1] - t[0] for t in times) / 4, number)
+    least = _LASTING * gap if is_given else gap
+    memories = np.geomspace(least, max(least, *(t[-1] / 4 - t[0] / 4 for t in times)), number)
     return np.array([(r, max(2 * z, 1.0) / m, z) for z in dampings for m in memories for r in RATIOS])
 
 
@@ -190,7 +196,7 @@ def fit_colour(
     gives it; None where it is profiled out. - `largest`: the largest sd of the coloured error; one as large as the
     signal would explain everything and mean nothing.
     """
-    grid = grid_of(times)
+    grid = grid_of(times, known is not None)
     ratio, frequency, damping = grid.T
     square: Any = 0.0
     logs: Any = 0.0

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .._effects import NOISE, OUTLIERS
+from .._effects import COORDINATE, NOISE, OUTLIERS, PAIR
 from ._beginning import STARTS, Beginning
 from ._calibrate import Priors
 from ._clocks import share_clocks
@@ -215,6 +215,7 @@ class Search:
         if self._is_near(0):
             if small := self._varied(scanned):
                 self.weigher.weigh(small, whole=True)
+            self._weigh_from_elsewhere()
             return
         along = promising(self.prospects.along(self.beginning.best, _FEW), _REACH)
         plain = {self._with(c) for c in self.problem.searched if not self.problem.candidate(c).effect.places}
@@ -239,6 +240,20 @@ class Search:
             if len(alike) < _ALIKE and sum(map(len, kept.values())) < _SMALL:
                 alike.append(start)
         return [start for alike in kept.values() for start in alike]
+
+    def _weigh_from_elsewhere(self) -> None:
+        """What acts where nothing is read, from several starts: the simulation as it is hardly tells where that begins,
+        and nothing of its side, which is another one for every recording."""
+        ones = [self._with(c) for c in self.problem.searched if self._is_unseen(c)]
+        starts = [Start(c, self.beginning.bare(z), 0.0) for z in self.beginning.seeds[:STARTS] for c in ones]
+        self._weigh_in_batches(starts)
+
+    def _is_unseen(self, member: int) -> bool:
+        """Whether an effect without a place acts on a coordinate of which nothing is read."""
+        one = self.problem.candidate(member)
+        if one.effect.acts_on not in (COORDINATE, PAIR) or one.effect.places or not one.effect.amplitudes:
+            return False
+        return any(i in self.beginning.unread for i in one.places)
 
     def _from_nothing(self, combination: Combination) -> Start:
         return Start(combination, self.beginning.from_seed(), 0.0)
