@@ -40,7 +40,6 @@ def check_recordings(simulation: SimulationFile, recordings: Sequence[_Rows]) ->
     """There is enough in the recordings to learn from."""
     _check_numbers(simulation, len(recordings))
     _check_missing(simulation, recordings)
-    _check_lengths(recordings)
     _check_rows(simulation, recordings)
     if not any(_moves(r.readings) for r in recordings):
         told = ", ".join(map(shown, simulation.recording.observe))
@@ -52,14 +51,6 @@ def check_recordings(simulation: SimulationFile, recordings: Sequence[_Rows]) ->
 def _names(recordings: Sequence[_Rows]) -> str:
     others = len(recordings) - 1
     return recordings[0].name + (f" and {others} more" if others else "")
-
-
-def _check_lengths(recordings: Sequence[_Rows]) -> None:
-    for r in recordings:
-        if len(r.readings) < 2:
-            raise InputError(
-                f"{r.name}: only one row is used, which shows no motion; give a second row, or leave the recording out"
-            )
 
 
 def _check_rows(simulation: SimulationFile, recordings: Sequence[_Rows]) -> None:

@@ -119,6 +119,13 @@ def test_a_few_rows_are_answered(rows):
     assert diagnose(cases.simulation("p**2/2 + 2*q**2"), [cases.recorded(times, y)], some).document["findings"] == []
 
 
+def test_a_single_row_is_refused():
+    """Beside a recording that is long enough, too: which one it is is said."""
+    rows = [cases.recorded(TIMES, np.cos(TIMES)), cases.recorded(TIMES[:1], np.ones(1), number=2)]
+    with pytest.raises(InputError, match="run2.csv: only one row is used"):
+        diagnose(swing(), rows, AS_USUAL)
+
+
 def test_a_short_recording_may_stand_beside_a_long_one():
     """Three rows beside two hundred, and inputs in both: they are answered together."""
     long, short = np.linspace(0.0, 20.0, 200), np.linspace(0.0, 1.0, 3)

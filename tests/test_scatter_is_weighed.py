@@ -8,6 +8,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import logsumexp
 from scipy.stats import norm, t
 
+from symplearn.diagnosis import Options, Restriction, diagnose
 from symplearn.diagnosis._scatter import factor_evidence, law_gain, outlier_evidence, suspects
 
 GIVEN = 0.1  # noise of the first column; that of the second is estimated
@@ -229,3 +230,18 @@ def test_a_column_with_outliers_has_no_other_heavy_tail(problem):
     for column in range(2):
         found = law_gain(problem, (member(problem, "sensor_outliers", column),), both)
         assert found == law_gain(problem, (), alone(both[:, 1 - column], 1 - column)) > 1
+
+
+def test_a_noise_that_is_given_too_small_is_no_error_with_a_memory():
+    """An oscillator with a damping that is missing, read with a Gaussian noise a quarter larger than what is given as
+    known: it is the noise that is told, as an error of the sensor that does not last is nothing else."""
+    times = np.linspace(0.0, 30.0, 300)
+    x = cases.solved(lambda t, x: [x[1], -x[0] - 0.05 * x[1]], [1.0, 0.0], times)[:, 0]
+    readings = x + 0.025 * np.random.default_rng(3).normal(size=300)
+    file = cases.simulation("p**2/2 + q**2/2", more="[recording.noise]\ny = 0.02\n")
+    some = Options(restriction=Restriction(("viscous_damping", "sensor_noise", "coulomb_friction")))
+    document = diagnose(file, [cases.recorded(times, readings, columns=("y",))], some).document
+    told = {one["effect"]: one for one in document["findings"]}
+    assert told.keys() == {"viscous_damping", "sensor_noise"}
+    low, high = told["sensor_noise"]["coefficients"]["s"]["interval95"]
+    assert low < 1.25 < high

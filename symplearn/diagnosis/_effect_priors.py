@@ -55,7 +55,7 @@ def _looseness(problem: Problem, priors: Priors, motion: Motion, i: int) -> floa
     Two bodies that a strong spring joins swing slowly together; seen alone, one looks as soft as that. What an unseen
     one may do is as strong as what the seen one's own stiffness may be.
     """
-    there = motion.forces[i] / rms(motion.q[:, i])
+    there = motion.forces[i] / rms(motion.q[:, i] - np.nanmean(motion.q[:, i]))
     return float(np.linalg.norm(motion.stiffening[i] * priors.widths(problem)) / there)
 
 

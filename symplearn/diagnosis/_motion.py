@@ -40,10 +40,10 @@ class Motion:
     forces: Float[np.ndarray, " d"]  # root mean square
     levels: Float[np.ndarray, " channel"]  # root mean square of the expected readings
     times: tuple[Float[np.ndarray, " _"], ...]  # by recording
-    # Power that forces which turn round with the motion feed into each coordinate, by row.
-    turning: Float[np.ndarray, "row d"]
     # What the stiffness of each coordinate changes by, per unit of each calibrated parameter.
     stiffening: Float[np.ndarray, "d parameter"] = field(default_factory=lambda: np.zeros((1, 0)))
+    # Power that forces which turn round with the motion feed into each coordinate, by row.
+    turning: Float[np.ndarray, "row d"] = field(default_factory=lambda: np.zeros((0, 1)))
 
     @property
     def first(self) -> float:
@@ -86,8 +86,8 @@ def motion_along(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarr
         forces=np.array([_there(push[:, i], own[i], rms(p[:, i]) / span) for i in range(d)]),
         levels=np.array([rms(column) for column in shown.T]),
         times=tuple(r.times[: len(path)] for r, path in zip(problem.rows, paths, strict=True)),
-        turning=turning,
         stiffening=stiffening(problem, z, paths),
+        turning=turning,
     )
 
 

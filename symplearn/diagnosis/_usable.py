@@ -30,8 +30,12 @@ _SAID = {
 
 
 def check_readings(recordings: Sequence[Recording]) -> None:
-    """No reading is so large that its square is no number. `InputError` otherwise."""
+    """Every recording has two rows, and no reading is so large that its square is no number. `InputError` otherwise."""
     for r in recordings:
+        if len(r.times) < 2:
+            raise InputError(
+                f"{r.name}: only one row is used, which shows no motion; give a second row, or leave the recording out"
+            )
         # NaN, where nothing was read, is not larger than anything.
         for row, column in np.argwhere(np.abs(r.readings) > _LARGEST)[:1]:
             raise InputError(
