@@ -106,8 +106,8 @@ def test_an_unseen_body_may_be_as_strong_as_the_spring_is_loose():
         for w in (weigher(k, carts(START)) for k in ("4.6", "{ value = 4.6, sd = 0.01 }", "{ value = 4.6 }"))
     )
     for scale, loose in ((near, 0.01 / 4.6), (open_, 10.0)):
-        # Seen: 7e-4 where nothing is known. What is swung about is the mean of what was recorded, not quite the rest: off
-        # by 0.02 of the swing, whose square comes in twice.
+        # Seen: 7e-4 where nothing is known. What is swung about is the mean of what was recorded, not quite the rest:
+        # off by 0.02 of the swing, whose square comes in twice.
         assert scale == pytest.approx(np.hypot(0.3, loose) / 0.3 * np.hypot(1, loose) * known, rel=1e-3)
 
 
