@@ -8,7 +8,7 @@ from finding_cases import TARGETS
 
 from symplearn._vocabulary import VOCABULARY
 from symplearn.diagnosis._impostors import SHOWS
-from symplearn.diagnosis._next import next_measurement
+from symplearn.diagnosis._next import all_rows, next_measurement
 
 q, k, y = ("theta",), ("k",), ("volt",)
 IMPOSTORS = [
@@ -88,3 +88,9 @@ def test_what_else_is_open_is_told_too():
         assert "more channels and a faster sampling" in next_measurement([[one]], verdict, 0.0, unexplained)
     assert "range it was found in" in next_measurement([[one]], "mismatch", 0.0, 0.0)
     assert "two known places" in next_measurement([[("sensor_gain", y)]], "mismatch", 0.0, 0.0)
+
+
+def test_rows_that_were_kept_from_names_in_doubt_are_asked_first():
+    """Where some were held out and the answer is likely only; not where it is sure, or none were."""
+    assert "--holdout 0: a share of 0.25" in all_rows(0.25, 0.6)
+    assert all_rows(0.25, 0.95) == all_rows(0.0, 0.6) == ""

@@ -78,6 +78,7 @@ def test_a_piece_of_the_motion_is_no_mismatch():
     ).document
     assert document["verdict"] == "consistent" and document["probability"] > 0.5
     assert any("constants and noise tell the readings as well" in one for one in document["warnings"])
+    assert "in which the simulated motion is seen" in document["next_measurement"]
 
 
 def pendulum(start):

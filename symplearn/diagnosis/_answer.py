@@ -25,6 +25,7 @@ from ._locate import (
     where_sentence,
     whole_windows,
 )
+from ._next import NOTHING_SHOWN, all_rows, next_measurement
 from ._options import Options
 from ._outlook import Outlook, intensity_of
 from ._posterior import CONSISTENT, Posterior, Weighed, posterior
@@ -35,7 +36,7 @@ from ._trajectory import Stepper
 from ._units import coefficient_units, time_unit
 from ._warnings import doubled, missed, set_back, warnings
 from ._weighed import Estimate, coloured_inflation
-from ._words import equation_lines, finding_sentence, next_measurement
+from ._words import equation_lines, finding_sentence
 
 VERSION = "0.1.0"
 # How readings are off, by kind of remainder.
@@ -188,10 +189,13 @@ class Answer:
 
     def _next(self) -> str:
         p = self.posterior
+        if p.is_constant:
+            return NOTHING_SHOWN
         top = max((w.probability for w in p.named), default=0.0)
         rivals = [[one.key for m in w.combination for one in self.problem.candidate(m).told()]
                   for w in p.named if w.probability > max(0.02, 0.1 * top)][:6]  # fmt: skip
-        return next_measurement(rivals, self.verdict, p.as_it_is, p.unexplained)
+        told = next_measurement(rivals, self.verdict, p.as_it_is, p.unexplained)
+        return told + (all_rows(self.options.holdout, self.chosen.probability) if self.chosen else "")
 
     def _probability(self) -> float:
         p = self.posterior

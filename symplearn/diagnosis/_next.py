@@ -8,6 +8,7 @@ from ._impostors import OVER_TIME, SHOWS, UNMASK
 _Key = tuple[str, tuple[str, ...]]  # effect and targets
 _Keys = frozenset[_Key]
 
+NOTHING_SHOWN = "one in which the simulated motion is seen: larger than the noise, and for longer than it takes to turn"
 _ANOTHER = "a recording at another amplitude, to test the law outside the range it was found in"
 _HARDER = "none is needed; a longer recording at another amplitude would test the simulation harder"
 _CLOSER = "more channels and a faster sampling where the strain is largest, to see what acts there"
@@ -19,6 +20,16 @@ _FORM = "recordings at other amplitudes and speeds: which form the force without
 # Where the simulation as it is, or a remainder without a name, has more than this, it is a rival itself.
 _OPEN, _SETTLED = 0.05, 0.9
 _MOST = 2
+# Below this probability of an answer the rows that were kept from it may tell more of its names.
+_SURE = 0.9
+
+
+def all_rows(holdout: float, probability: float) -> str:
+    """That held-out rows may tell more of names that are in doubt, to stand behind what is to be recorded; else
+    nothing."""
+    if holdout <= 0 or probability >= _SURE:
+        return ""
+    return f"; but first ask these rows again with --holdout 0: a share of {holdout:g} of them was kept from the names"
 
 
 def next_measurement(

@@ -11,7 +11,6 @@ from ._consequences import Said, consequence
 from ._law_text import equation_lines as equation_lines
 from ._law_text import law_text as law_text
 from ._law_text import symbolic_law, symbols
-from ._next import next_measurement as next_measurement
 
 _OPENINGS = {
     "viscous_damping": "A force against the motion of {q}, proportional to its speed, was left out",
