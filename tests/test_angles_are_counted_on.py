@@ -52,6 +52,8 @@ effect = "linear_stiffness"
 target = "q"
 k = 0.1
 """)),
+    "a scale that is not known": (
+        2 * np.pi * (0.45 * TIMES % 1.0), rotor("s*q", more="[parameters]\ns = { value = 1.0, sd = 0.1 }")),
     "a force of the file winds up": (2 * np.pi * (0.45 * TIMES % 1.0), rotor("q", more='[forces]\np = "-0.1*q"')),
     "the sine of an angle": (np.sin(7 * TIMES) * np.pi, rotor("pi*sin(q)")),
 }  # fmt: skip

@@ -39,9 +39,7 @@ def across_gaps(weigher: Weigher, combination: Combination) -> Start | None:
         drawn = _drawn(weigher, combination, z, rows)
         more = [min(begin + _NEXT, later) if k == r else n for k, n in enumerate(weigher.rows)]
         predictions = weigher.stepper.predict(drawn, [combination] * len(drawn), more)
-        spread = np.nanstd(problem.rows[r].readings, axis=0)
-        behind = predictions[r].readings[:, begin : more[r]]
-        if not np.nanmax(np.nanstd(np.where(np.isfinite(behind), behind, np.nan), axis=0) / spread) > _OPEN:
+        if not _scatter(problem, r, weigher.rows[r], predictions[r].readings[:, begin : more[r]]) > _OPEN:
             continue
         is_open = True
         misfit = sum(value for _, value in ranked(problem, predictions, more))
@@ -53,6 +51,17 @@ def across_gaps(weigher: Weigher, combination: Combination) -> Start | None:
             some = fits.z
         z = fits.z[_best(weigher, fits, window)]
     return Start(combination, z, 0.0) if is_open else None
+
+
+def _scatter(problem: Problem, r: int, rows: int, behind: Float[np.ndarray, "lane row channel"]) -> float:
+    """How far draws that stay finite lie apart, by the spread of what was read of a recording; the most of any
+    column."""
+    some, found = behind[np.isfinite(behind).all((1, 2))], [0.0]
+    for j, column in enumerate(problem.rows[r].readings[:rows].T):
+        spread = float(np.std(column[np.isfinite(column)])) if np.isfinite(column).any() else 0.0
+        if spread > 0 and len(some) > 1:
+            found.append(float(np.std(some[..., j], axis=0).max()) / spread)
+    return max(found)
 
 
 def _gaps(problem: Problem, rows: list[int]) -> Iterator[tuple[int, int, int, int]]:

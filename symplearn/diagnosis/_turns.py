@@ -56,8 +56,8 @@ def _turns(file: SimulationFile) -> Iterator[tuple[str, float | None, bool]]:
 
 
 def _slope(file: SimulationFile, tree: sympy.Expr, angle: sympy.Symbol) -> float | None:
-    """2 pi c of c times an angle plus a constant; None of anything else."""
-    given = {symbol(name): one.value for name, one in file.parameters.items()}
+    """2 pi c of c times an angle plus a constant, both known; None of anything else."""
+    given = {symbol(name): one.value for name, one in file.parameters.items() if one.known}
     slope, rest = sympy.diff(tree, angle).subs(given), tree.subs(angle, 0).subs(given)
     if not (slope.is_number and rest.is_number):
         return None
