@@ -21,8 +21,11 @@ from ._unnamed import along_path
 class Extended:
     """The problem of a search with forces without a name behind its candidates."""
 
-    def __init__(self, file: SimulationFile, recordings: Sequence[Recording], options: Options, search: Search):
+    def __init__(
+        self, file: SimulationFile, recordings: Sequence[Recording], options: Options, search: Search, longest: float
+    ):
         self.file, self.recordings, self.options, self.search = file, recordings, options, search
+        self.longest = longest  # substep that the problem was laid out with
         # Coordinates that a term of the file without a name pushes already.
         self._taken = {file.coordinates.index(term.target[0]) for term in file.terms if term.effect == UNNAMED.name}
 
@@ -37,10 +40,9 @@ class Extended:
         """Let the search go on with these, of which the first ones may be known to it."""
         search, times = self.search, self.recordings[0].times
         first, middle = float(times[0]), float(np.mean(times[[0, -1]]))
-        restriction, problem = self.options.restriction, search.problem
+        restriction = self.options.restriction
         built = augmented_equations(self.file, first, restriction, middle, forces)
-        longest = float(np.max(problem.rows[0].spans.step)) * (1 + 1e-9)
-        problem = build(self.file, built, self.recordings, self.options.holdout, longest, restriction)
+        problem = build(self.file, built, self.recordings, self.options.holdout, self.longest, restriction)
         priors = with_nameless(problem, search.found.priors, self._scales(forces), [self._span(one) for one in forces])
         search.goes_on(Stepper(problem, self.options.jobs), priors)
 

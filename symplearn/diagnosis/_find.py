@@ -55,7 +55,7 @@ def searched(
     stepper = stepper if finer is problem else Stepper(finer, options.jobs)
     search = _run(stepper, seeds.z, deadline, options)
     steps = _refined(search, rebuild, (substep, is_fine), options)
-    weigh_nameless(file, recordings, options, search)
+    weigh_nameless(file, recordings, options, search, steps[0])
     likeliest = max(search.found.estimates, key=search.found.odds)
     if any(search.problem.candidate(m).nameless for m in likeliest):  # its shape may pass faster than the motion
         steps = _refined(search, lambda longest: rebuild(longest, search.problem.equations), steps, options)

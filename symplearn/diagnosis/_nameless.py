@@ -41,14 +41,16 @@ _SHAPED, _BLUNT, _SHARPER = 2, 15.0, ((3.0, 2.0, 1.0), (1.0, 0.5), (0.25,))
 _LATER = ("clock", "static", "force", "spell")
 
 
-def weigh_nameless(file: SimulationFile, recordings: Sequence[Recording], options: Options, search: Search) -> None:
+def weigh_nameless(
+    file: SimulationFile, recordings: Sequence[Recording], options: Options, search: Search, longest: float
+) -> None:
     """Where something is missing, weigh forces that have no word beside those that do: simple laws; and where nothing
     fits then, expressions that were fitted to the missing force. None on a coordinate that a term of the file without a
     name pushes already (contract, section 4)."""
     if not options.restriction.has(UNNAMED) or not search.in_time() or _odds(search).as_it_is >= CONSISTENT:
         return
     options.progress("weighing laws of force without a name")
-    begun, outlooks = Extended(file, recordings, options, search), _outlooks(search)
+    begun, outlooks = Extended(file, recordings, options, search, longest), _outlooks(search)
     shapes = Shapes(file, outlooks)
     known = [*priced(begun.usable(laws(file))), *begun.usable(shapes.first())]
     number, known = len(known), [*known, *(_that_fade(search, begun, outlooks) if _is_doubtful(search) else [])]
