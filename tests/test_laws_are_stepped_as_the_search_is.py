@@ -2,6 +2,7 @@
 
 import engine_cases as cases
 import numpy as np
+import pytest
 
 from symplearn.diagnosis import Options, Restriction, diagnose
 from symplearn.diagnosis._extended import Extended
@@ -12,6 +13,7 @@ def pieces(problem):
     return [int(np.asarray(r.spans.pieces)[0]) for r in problem.rows]
 
 
+@pytest.mark.slow
 def test_laws_are_laid_out_in_the_same_substeps(monkeypatch):
     """Of two recordings one has rows five times as far apart as the other, and as many substeps in each of its spans. A
     damping that goes with the square of the place has no name, so that laws are asked for."""

@@ -3,6 +3,7 @@ it does not tell on which side it begins, in any of several recordings."""
 
 import engine_cases as cases
 import numpy as np
+import pytest
 
 from symplearn.diagnosis import Options, Restriction, diagnose
 
@@ -21,6 +22,7 @@ def ring(b, start):
     return cases.solved(rates, start, TIMES)[:, 3]
 
 
+@pytest.mark.slow
 def test_a_gyroscopic_force_is_found_through_the_mode_that_is_read():
     """Two recordings whose unread modes begin on different sides: the coupling is told, in its interval."""
     file = cases.simulation(
