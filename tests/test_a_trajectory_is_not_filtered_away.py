@@ -125,6 +125,6 @@ def test_about_a_path_a_linear_filter_is_exact():
         # Round-off of sixty rows; 5e-14 was seen.
         np.testing.assert_allclose(getattr(found, name)[:n], getattr(expected, name)[:n], atol=1e-11)
     for name in ("means", "disturbances", "standardised_disturbances", "standardised_residuals"):
-        # The same; 8e-14 was seen.
         shown, other = getattr(smoothed, name), np.asarray(getattr(known, name))
+        # The same there and back; 8e-14 was seen.
         np.testing.assert_allclose(shown[: rows[0] - 1], other[: rows[0] - 1], atol=1e-11)

@@ -52,6 +52,13 @@ effect = "linear_stiffness"
 target = "q"
 k = 0.1
 """)),
+    "an activity of the file goes with the place": (2 * np.pi * (0.45 * TIMES % 1.0), rotor("q", more="""
+[[terms]]
+effect = "self_excitation"
+target = "q"
+c = 0.1
+a = 1.0
+""")),
     "a scale that is not known": (
         2 * np.pi * (0.45 * TIMES % 1.0), rotor("s*q", more="[parameters]\ns = { value = 1.0, sd = 0.1 }")),
     "a force of the file winds up": (2 * np.pi * (0.45 * TIMES % 1.0), rotor("q", more='[forces]\np = "-0.1*q"')),

@@ -55,8 +55,8 @@ def test_starts_are_tried_in_every_mixture(swings):
     assert ranks[0] == (0, 0, 0) and sorted(ranks[:6]) == [(a, 0, b) for a in range(2) for b in range(3)]
     assert [sum(one) for one in ranks[:6]] == [0, 1, 1, 2, 2, 3] and ranks[6:] == [(6, 6, 6), (7, 7, 7)]
     states = np.array([[1.0, -2.0], [1.001, -2.0], [1.0, 2.0], [np.nan, 2.0], [0.999, 2.001]])
-    assert begin._apart_first(states, 5) == ([0, 2, 3], [1, 4])
-    assert begin._apart_first(states, 2) == ([0], [1, 2, 3, 4])
+    assert begin.apart_first(states, 5) == ([0, 2, 3], [1, 4])
+    assert begin.apart_first(states, 2) == ([0], [1, 2, 3, 4])
 
 
 def test_what_follows_the_first_readings_best_is_tried_first(swings):

@@ -13,7 +13,7 @@ from PIL import Image
 from symplearn._vocabulary import VOCABULARY
 from symplearn.report import html_report
 from symplearn.report._decimate import envelope
-from symplearn.report._force import force_panels, missing
+from symplearn.report._force import energy_limits, force_panels, missing
 from symplearn.report._law import Motion, added_force
 from symplearn.report._motion import channel, close_up_window, motion_panels
 from symplearn.report._palette import AFTER, BEFORE, LAW, READING, SHADE
@@ -48,6 +48,16 @@ def test_a_simulation_that_diverges_is_still_drawn():
     page = html_report(cases.damped_pendulum(series=tuple(recordings)))
     # Four of the first recording, two of each other, three of the force, one of the energy.
     assert page.count("<img") == 4 + 6 + 3 + 1
+
+
+def test_an_energy_that_is_lost_is_in_the_picture():
+    """Beside one that is kept to a millionth, whichever of the two comes first; one that runs away is not."""
+    kept, lost = -0.5 + 1e-6 * np.sin(np.arange(500.0)), -0.5 - 3.0 * np.linspace(0.0, 1.0, 500)
+    for pair in ((kept, lost), (lost, kept)):
+        low, high = energy_limits(*pair)
+        assert low < -3.5 and -0.5 < high and high - low < 1.13 * 3.0  # a margin of 6 % on either side
+    away = -0.5 + np.exp(np.linspace(-100.0, 200.0, 500))
+    assert np.ptp(energy_limits(away, lost)) < 3 * 3.0 * 1.13
 
 
 def test_an_envelope_covers_the_line():

@@ -57,25 +57,30 @@ def within_the_motion(problem: Problem, priors: Priors) -> Priors:
 
 
 def around(
-    problem: Problem, fits: Fits, lanes: Int[np.ndarray, " some"], priors: Priors, rows: Sequence[int]
+    problem: Problem,
+    fits: Fits,
+    lanes: Int[np.ndarray, " some"],
+    priors: Priors,
+    rows: Sequence[int],
+    number: int = _DRAWN,
 ) -> Float[np.ndarray, "lane z"]:
-    """Draws about some fitted lanes, as far off as their rows and priors leave open: of Laplace's normal density, half
-    as wide, as wide, and twice as wide."""
-    rng, centres = np.random.default_rng(1), np.resize(lanes, _DRAWN)
-    active = problem.active(())
-    precision = priors.precision_of(problem, ())
+    """Draws about some fitted lanes of one combination, as far off as their rows and priors leave open: of Laplace's
+    normal density, half as wide, as wide, and twice as wide."""
+    rng, centres, combination = np.random.default_rng(1), np.resize(lanes, number), fits.combinations[lanes[0]]
+    active = problem.active(combination)
+    precision = priors.precision_of(problem, combination)
     open_ended = np.flatnonzero(_unknown(problem))
     # Where nothing is known, the motion's own size.
     precision[open_ended] += _unit_sizes(_sizes(problem, priors))[open_ended] ** -2.0
     with np.errstate(all="ignore"):  # a lane that ran away
         matrix = normal_equations(problem, fits, weights(problem, rows))[0]
-    steps = np.zeros((_DRAWN, problem.size))
+    steps = np.zeros((number, problem.size))
     for lane in lanes:
         own, told = centres == lane, matrix[lane][np.ix_(active, active)]
         root = _root(np.diag(precision[active]) + (told if np.isfinite(told).all() else 0.0))
         steps[np.ix_(own, active)] = rng.normal(size=(own.sum(), len(root))) @ root.T
-    lower, upper = priors.bounds_of(problem, ())
-    spread = rng.choice(_ABOUT, _DRAWN)[:, None]
+    lower, upper = priors.bounds_of(problem, combination)
+    spread = rng.choice(_ABOUT, number)[:, None]
     return np.clip(fits.z[centres] + spread * steps, lower, upper)
 
 

@@ -6,22 +6,21 @@ go on that follow the next rows best.
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
-from ._calibrate import Fits, calibrate
+from ._calibrate import calibrate
+from ._drawn import around
 from ._problem import Combination, Problem
 from ._score import Start
-from ._start import ranked
-from ._weighed import weigh_white
+from ._start import likelihood, ranked
 from ._weigher import Weigher
 
 # Rows that were left empty one after the other, as many as make a gap.
 _LONG = 10
-# Draws, and those that are fitted; how many times as wide as the rows before leave open.
-_DRAWN, _KEPT, _WIDTHS = 128, 8, (0.5, 1.0, 2.0)
+# Draws, and those that are fitted.
+_DRAWN, _KEPT = 128, 8
 # Rows behind a gap that draws are to follow; the share of the readings' spread by which draws scatter there from which
 # on they may be swings apart.
 _NEXT, _OPEN = 16, 0.3
@@ -36,7 +35,8 @@ def across_gaps(weigher: Weigher, combination: Combination) -> Start | None:
     z, is_open = white.z, False
     for r, end, begin, later in _gaps(problem, weigher.rows):
         rows = [end if k == r else n for k, n in enumerate(weigher.rows)]
-        drawn = _drawn(weigher, combination, z, rows)
+        before = calibrate(weigher.stepper, z[None], [combination], weigher.found.priors, rows, _STEPS)
+        drawn = around(problem, before, np.zeros(1, int), weigher.found.priors, rows, _DRAWN)
         more = [min(begin + _NEXT, later) if k == r else n for k, n in enumerate(weigher.rows)]
         predictions = weigher.stepper.predict(drawn, [combination] * len(drawn), more)
         if not _scatter(problem, r, weigher.rows[r], predictions[r].readings[:, begin : more[r]]) > _OPEN:
@@ -49,7 +49,7 @@ def across_gaps(weigher: Weigher, combination: Combination) -> Start | None:
         for part in (more, window):
             fits = calibrate(weigher.stepper, some, [combination] * len(some), weigher.found.priors, part, _STEPS)
             some = fits.z
-        z = fits.z[_best(weigher, fits, window)]
+        z = fits.z[likelihood(problem, fits, window).argmin()]
     return Start(combination, z, 0.0) if is_open else None
 
 
@@ -72,24 +72,3 @@ def _gaps(problem: Problem, rows: list[int]) -> Iterator[tuple[int, int, int, in
         ends = [*(int(seen[k]) + 1 for k in wide), n]
         for k, (end, later) in zip(wide, zip(ends[:-1], ends[1:], strict=True), strict=True):
             yield r, end, int(seen[k + 1]), later
-
-
-def _drawn(
-    weigher: Weigher, combination: Combination, z: Float[np.ndarray, " z"], rows: list[int]
-) -> Float[np.ndarray, "lane z"]:
-    """Draws of what some rows leave open about a fit to them."""
-    problem, priors = weigher.problem, weigher.found.priors
-    fits = calibrate(weigher.stepper, z[None], [combination], priors, rows, _STEPS)
-    (one,) = weigh_white(problem, replace(fits, converged=np.ones(1, bool)), priors, rows)
-    values, vectors = np.linalg.eigh(one.covariance)
-    rng = np.random.default_rng(0)
-    units = rng.choice(_WIDTHS, (_DRAWN, 1)) * rng.normal(size=(_DRAWN, len(z)))
-    units[0] = 0.0
-    found = one.z + (units * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return np.clip(found, *priors.bounds_of(problem, combination))
-
-
-def _best(weigher: Weigher, fits: Fits, rows: list[int]) -> int:
-    fits = replace(fits, converged=np.ones(len(fits.z), bool))
-    values = [one.log_evidence for one in weigh_white(weigher.problem, fits, weigher.found.priors, rows)]
-    return int(np.argmax(np.where(np.isnan(values), -np.inf, values)))

@@ -20,7 +20,7 @@ from ._remainders import Remainders
 from ._score import Start
 from ._settle import settle
 from ._spells import Spells
-from ._start import priors_without_effects
+from ._start import apart_first, priors_without_effects
 from ._trajectory import Stepper
 from ._weigher import KEPT, Weigher
 
@@ -244,11 +244,12 @@ class Search:
     def _weigh_from_elsewhere(self) -> None:
         """What acts where nothing is read, from several starts: the simulation as it is hardly tells where that begins,
         and nothing of its side, which is another one for every recording."""
-        ones = [self._with(c) for c in self.problem.searched if self._is_unseen(c)]
-        starts = [Start(c, self.beginning.bare(z), 0.0) for z in self.beginning.seeds[:STARTS] for c in ones]
-        self._weigh_in_batches(starts)
+        ones = [self._with(c) for c in self.problem.searched if self._acts_unread(c)]
+        seeds = self.beginning.seeds
+        apart, _ = apart_first(seeds[:, : self.problem.head], len(seeds))
+        self._weigh_in_batches([Start(c, self.beginning.bare(z), 0.0) for z in seeds[apart[:STARTS]] for c in ones])
 
-    def _is_unseen(self, member: int) -> bool:
+    def _acts_unread(self, member: int) -> bool:
         """Whether an effect without a place acts on a coordinate of which nothing is read."""
         one = self.problem.candidate(member)
         if one.effect.acts_on not in (COORDINATE, PAIR) or one.effect.places or not one.effect.amplitudes:

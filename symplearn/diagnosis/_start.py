@@ -71,15 +71,15 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
     short = [[min(n, least) for n in rows] for least in _SHORT]
     short += windows(rows, (0.02, 0.04, 0.08), max(_SHORT[-1], 4 * problem.state))
     fits, nearby = _begun(stepper, priors, short, False), within_the_motion(problem, priors)
-    value = _likelihood(problem, fits, short[-1])
+    value = likelihood(problem, fits, short[-1])
     if nearby is not priors:
         # The motion's size is an order of magnitude, and may be wrong: only what had gone astray is begun within it.
         other = _begun(stepper, nearby, short, True)
-        if (better := _likelihood(problem, other, short[-1])).min() < value.min() - 2 * _HOPELESS:
+        if (better := likelihood(problem, other, short[-1])).min() < value.min() - 2 * _HOPELESS:
             fits, value = other, better
     ranked = np.argsort(value)
     near = int((value[ranked] <= value[ranked[0]] + 2 * _HOPELESS * len(rows)).sum())
-    apart, alike = _apart_first(fits.z[ranked, : problem.head], near)
+    apart, alike = apart_first(fits.z[ranked, : problem.head], near)
     order = ranked[[*apart, *alike]]
     z = np.stack([without_turns(problem, z) for z in fits.z[order]])
     return Fits([()] * _STARTS, z, fits.noise[order], [], fits.cost[order], fits.converged[order])
@@ -95,7 +95,7 @@ def _begun(stepper: Stepper, priors: Priors, short: Sequence[Sequence[int]], is_
         if is_careful and window != before:
             starts.append(_ahead_of(stepper, fits, held, before, window))
         ways = [calibrate(stepper, z, [()] * _STARTS, held, window, 40) for z in starts]
-        best = [_likelihood(problem, way, window).min() for way in ways]
+        best = [likelihood(problem, way, window).min() for way in ways]
         fits = ways[-1] if best[-1] < best[0] - 2 * _HOPELESS else ways[0]
     return fits
 
@@ -119,7 +119,7 @@ def _ahead_of(
     What a few rows leave open is a valley, and fits slide along it to one place. Where a body comes close to a centre,
     how it goes on from there is no longer open, and no fit finds the way back.
     """
-    value = _likelihood(stepper.problem, fits, rows)
+    value = likelihood(stepper.problem, fits, rows)
     likely = np.flatnonzero(value <= value.min() + 2 * _HOPELESS * len(rows))
     drawn = around(stepper.problem, fits, likely, priors, rows)
     predictions = stepper.predict(drawn, [()] * len(drawn), more)
@@ -170,7 +170,7 @@ def _recombined(
     orders, apart = [], []
     for r, (order, misfit) in enumerate(ranked(problem, predictions, rows)):
         near = int((misfit[order] <= misfit[order[0]] + 2 * _HOPELESS).sum())
-        first, others = _apart_first(lanes[order, r * problem.state : (r + 1) * problem.state], near)
+        first, others = apart_first(lanes[order, r * problem.state : (r + 1) * problem.state], near)
         orders.append(order[[*first, *others]])
         apart.append(len(first))
     return _joined(problem, lanes, orders, _ranks(apart, len(lanes)))
@@ -202,7 +202,7 @@ def _joined(
     return z
 
 
-def _apart_first(x: Float[np.ndarray, "lane state"], near: int) -> tuple[list[int], list[int]]:
+def apart_first(x: Float[np.ndarray, "lane state"], near: int) -> tuple[list[int], list[int]]:
     """Which of so many leading states lie apart from all before them, and the others."""
     finite = x[np.isfinite(x).all(1)]
     alike = _ALIKE * np.quantile(np.abs(finite), _LARGE, axis=0) if len(finite) else np.zeros(x.shape[1])
@@ -241,7 +241,7 @@ def _tightened(problem: Problem, priors: Priors) -> Priors:
     return replace(priors, precision=precision)
 
 
-def _likelihood(problem: Problem, fits: Fits, rows: Sequence[int]) -> np.ndarray:
+def likelihood(problem: Problem, fits: Fits, rows: Sequence[int]) -> np.ndarray:
     """Minus twice the profile likelihood, infinite for a lane that ran away: with an estimated noise the cost alone
     tells nothing."""
     number = sum((r.counts[:n] > 0).sum(0) for r, n in zip(problem.rows, rows, strict=True))

@@ -5,12 +5,13 @@ turns. One that the simulation itself keeps within a turn, c atan2(y, x) + d, ca
 which side a reading falls, and the two on both sides are left out.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import sympy
 
+from .._effects import COULOMB, FORCING, GYROSCOPIC, IMPULSE, POWERS, QUADRATIC, RELATIVE, VISCOUS
 from .._expression import symbol
 from .._recording import Recording
 from .._simulation_records import SimulationFile
@@ -20,6 +21,10 @@ from .._simulation_records import SimulationFile
 _STEP, _BEYOND = 0.8, 0.02
 # Of more than this share of the steps none is: what turns so fast is read too rarely to be counted.
 _OFTEN = 0.25
+# Forces on a coordinate that do not hang on where it is.
+_PLACELESS = frozenset(
+    one.name for one in (VISCOUS, QUADRATIC, COULOMB, RELATIVE, GYROSCOPIC, POWERS[0], FORCING, IMPULSE)
+)
 # Phase points, in which what a turn leaves as it is differs by round-off alone.
 _PLACES, _ROUND_OFF = (0.3, 1.1, -0.7), 1e-9
 
@@ -27,32 +32,33 @@ _PLACES, _ROUND_OFF = (0.3, 1.1, -0.7), 1e-9
 def unwrapped(file: SimulationFile, recordings: Sequence[Recording]) -> tuple[list[Recording], list[str]]:
     """The recordings with their angles counted on over whole turns, and what was done, in sentences."""
     out, told = list(recordings), []
-    for j, (column, turn, is_kept) in enumerate(_turns(file)):
-        if turn is None:
+    for j, (column, expression) in enumerate(file.recording.observe.items()):
+        arcs = expression.tree.atoms(sympy.atan2)
+        turn, coordinate = _kept(file, expression.tree, arcs) if arcs else _counted(file, expression.tree)
+        jumps = [_jumps(r.readings[:, j], turn) for r in out] if turn else []
+        number = sum(map(len, jumps))
+        # Whether turns change anything is asked last: a long Hamiltonian takes its time.
+        if turn is None or not number or (coordinate and not _is_cyclic(file, coordinate)):
             continue
-        jumps = [_jumps(r.readings[:, j], turn) for r in out]
-        if number := sum(map(len, jumps)):
-            one = _without_sides if is_kept else _counted_on
-            out = [replace(r, readings=one(r.readings, j, at, turn)) for r, at in zip(out, jumps, strict=True)]
-            done = "the readings on both sides were left out" if is_kept else "it was counted on over whole turns"
-            times = "once" if number == 1 else f"{number} times"
-            told.append(f"{column} jumps {times} by a whole turn ({turn:.6g}), as an angle does at its end: {done}")
+        one = _counted_on if coordinate else _without_sides
+        out = [replace(r, readings=one(r.readings, j, at, turn)) for r, at in zip(out, jumps, strict=True)]
+        done = "it was counted on over whole turns" if coordinate else "the readings on both sides were left out"
+        times = "once" if number == 1 else f"{number} times"
+        told.append(f"{column} jumps {times} by a whole turn ({turn:.6g}), as an angle does at its end: {done}")
     return out, told
 
 
-def _turns(file: SimulationFile) -> Iterator[tuple[str, float | None, bool]]:
-    """Of every column what a whole turn adds to its reading, None where it is no angle, and whether the simulation
-    keeps it within one."""
-    for column, expression in file.recording.observe.items():
-        tree = expression.tree
-        arcs = tree.atoms(sympy.atan2)
-        if len(arcs) == 1:
-            angle = sympy.Dummy(real=True)
-            yield column, _slope(file, tree.subs(next(iter(arcs)), angle), angle), True
-            continue
-        moved = [q for q in file.coordinates if symbol(q) in tree.free_symbols]
-        is_angle = len(moved) == 1 and _is_cyclic(file, moved[0])
-        yield column, _slope(file, tree, symbol(moved[0])) if is_angle else None, False
+def _kept(file: SimulationFile, tree: sympy.Expr, arcs: Iterable[sympy.Expr]) -> tuple[float | None, None]:
+    """What a whole turn is to a reading that the simulation keeps within one, by a single arc."""
+    first, *others = arcs
+    angle = sympy.Dummy(real=True)
+    return None if others else _slope(file, tree.subs(first, angle), angle), None
+
+
+def _counted(file: SimulationFile, tree: sympy.Expr) -> tuple[float | None, str | None]:
+    """What a whole turn of a coordinate adds to a reading, and that coordinate; None where it is no angle."""
+    moved = [q for q in file.coordinates if symbol(q) in tree.free_symbols]
+    return (_slope(file, tree, symbol(moved[0])), moved[0]) if len(moved) == 1 else (None, None)
 
 
 def _slope(file: SimulationFile, tree: sympy.Expr, angle: sympy.Symbol) -> float | None:
@@ -68,7 +74,7 @@ def _slope(file: SimulationFile, tree: sympy.Expr, angle: sympy.Symbol) -> float
 def _is_cyclic(file: SimulationFile, coordinate: str) -> bool:
     """Whether whole turns of a coordinate change nothing that moves it."""
     q = symbol(coordinate)
-    if any(term.effect.endswith("stiffness") and coordinate in term.target for term in file.terms):
+    if any(coordinate in term.target and term.effect not in _PLACELESS for term in file.terms if not term.expression):
         return False
 
     def changed(tree: sympy.Expr) -> sympy.Expr:

@@ -15,6 +15,7 @@ from ._panel import Panel, finite, first_look, labels, legend, limits, line, pan
 from ._units import force_unit, time_unit
 
 _LAW = 30.0  # ranges of the estimate that a law may lie outside of it and is in the picture still
+_AWAY = 100.0  # times its middle half that an energy ranges over at most, unless it runs away
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +107,21 @@ def energy_panels(diagnosis: Diagnosis, series: Series) -> list[Panel]:
     return [panel(lambda axes: _energy(axes, diagnosis, series), "Energy along the motion")]
 
 
+def energy_limits(*every: Float[np.ndarray, " fitted"]) -> tuple[float, float]:
+    """The range of energies but for those that run away: one that is lost, or fed in, ranges farther than one that is
+    kept by any number of times."""
+    steady = [one for one in every if _is_steady(finite(one))]
+    return limits(np.concatenate(steady or [every[0]]), *every)
+
+
+def _is_steady(values: Float[np.ndarray, " kept"]) -> bool:
+    """Whether all values are not too far from their middle half."""
+    return bool(values.size) and float(np.ptp(values)) <= _AWAY * float(np.ptp(np.quantile(values, [0.25, 0.75])))
+
+
 def _energy(axes: Axes, diagnosis: Diagnosis, series: Series) -> None:
     t, changed = series.fitted_times, diagnosis.document["verdict"] != "consistent"
-    axes.set_ylim(limits(series.energy_before, *([series.energy_after] if changed else [])))
+    axes.set_ylim(energy_limits(series.energy_before, *([series.energy_after] if changed else [])))
     line(axes, t, series.energy_before, linewidth=1.0, **first_look(changed))
     if changed:
         line(axes, t, series.energy_after, color=AFTER, linewidth=1.4, label="after")
