@@ -1,5 +1,6 @@
 """The augmented simulation as a Hamiltonian system: its energy with every effect, and forces that a velocity enters."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -25,11 +26,14 @@ from ._effects import (
     QUADRATIC,
     REGIME,
     RELATIVE,
+    SIDES,
     STOP,
     VISCOUS,
     Effect,
 )
 
+# Logarithm of two speeds between which a stop is stepped alike.
+_OCTAVE = math.log(2.0)
 # The values of an effect by target, by its name and side; a tuple over its values.
 Values = Mapping[tuple[str, str | None], tuple[Float[Array, " target"], ...]]
 
@@ -54,15 +58,17 @@ class Switches(eqx.Module):
     delays: Bool[Array, ""] | bool = True
     forcing: Bool[Array, ""] | bool = True
     changes: Bool[Array, ""] | bool = True  # of parameters, periodic or sudden
+    stops: Bool[Array, ""] | bool = True
 
 
 EVERYTHING = Switches()
 
 
 class Moment(eqx.Module):
-    """What depends on time alone: parameters as they stand, and periodic forces."""
+    """What depends on time alone: parameters as they stand, and periodic forces; and the time that it stands for."""
 
     time: Float[Array, "..."]
+    width: Float[Array, "..."]
     parameters: Float[Array, "... parameter"]
     push: Float[Array, "... declared"]
 
@@ -78,6 +84,7 @@ class SimulatedHamiltonian(ig.AbstractHamiltonian):
     values: Values
     inputs: Float[Array, " input"]
     moment: Moment
+    switches: Switches = EVERYTHING
 
     def of(self, effect: Effect, value: int = 0, side: str | None = None) -> Float[Array, " target"]:
         """One value of an effect, by target."""
@@ -101,14 +108,24 @@ class SimulatedHamiltonian(ig.AbstractHamiltonian):
         """Minus every force that no velocity enters."""
         d, n = self.equations.dim, self.equations.declared
         push = self.moment.push
-        push = push - self.of(STOP, 0, "upper") * jnp.maximum(q[:n] - self.of(STOP, 1, "upper"), 0.0)
-        push = push + self.of(STOP, 0, "lower") * jnp.maximum(self.of(STOP, 1, "lower") - q[:n], 0.0)
+        push = jax.lax.cond(self.switches.stops, lambda push: push + self._stopped(q, p), lambda push: push, push)
         slope = self.equations.slope(self.arguments(q, p))
         if not self.equations.hidden:
             return slope - jnp.pad(push, (0, d - n))
         present, omega = self.of(HIDDEN, 2), self.of(HIDDEN, 1)
         unseen = (present * omega**2).sum() * q[d] - (self.of(HIDDEN) * q[:n]).sum()
         return jnp.concatenate([slope - jnp.pad(push + present * q[d], (0, d - n)), unseen[None]])
+
+    def _stopped(self, q: Float[Array, " width"], p: Float[Array, " width"]) -> Float[Array, " declared"]:
+        """Forces of the stops, each by its mean over the time that the moment stands for.
+
+        Those of one instant would make the slopes of a trajectory jump where a substep comes to lie inside or outside,
+        each time by the impulse of a whole substep: how hard a stop is would look far better known than it is.
+        """
+        n = self.equations.declared
+        half = 0.5 * self.moment.width * _octave(self.velocity(q, p)[:n])
+        (k, a), (low_k, low_a) = ([self.of(STOP, value, side) for value in range(2)] for side in SIDES)
+        return low_k * _mean_excess(low_a - q[:n], half) - k * _mean_excess(q[:n] - a, half)
 
     @eqx.filter_jit
     def smooth_force(self, q: Float[Array, " width"], p: Float[Array, " width"]) -> Float[Array, " width"]:
@@ -154,6 +171,18 @@ class SimulatedHamiltonian(ig.AbstractHamiltonian):
         return self.vector_field(x) + jnp.concatenate([before, force])
 
 
+def _octave(v: Float[Array, " d"]) -> Float[Array, " d"]:
+    """Speeds rounded up to a power of two: a force that goes with them but in steps is one that no velocity enters, and
+    its flow is symplectic."""
+    return jnp.exp(_OCTAVE * (jnp.floor(jnp.log(jax.lax.stop_gradient(jnp.abs(v))) / _OCTAVE) + 1.0))
+
+
+def _mean_excess(x: Float[Array, " d"], half: Float[Array, " d"]) -> Float[Array, " d"]:
+    """Mean of what is above zero of what goes evenly from x - half to x + half."""
+    crosses = jnp.abs(x) < half
+    return jnp.where(crosses, (x + half) ** 2 / (4 * jnp.where(crosses, half, 1.0)), jnp.maximum(x, 0.0))
+
+
 class Simulated(eqx.Module):
     """An augmented simulation with its numbers: what gives its Hamiltonian at any time."""
 
@@ -173,7 +202,7 @@ class Simulated(eqx.Module):
     ) -> SimulatedHamiltonian:
         """The system with all that depends on time as it stands at one time; `width` as in `moment`."""
         moment = self.moment(jnp.asarray(t, self.coefficients.dtype), width)
-        return SimulatedHamiltonian(self.equations, self.coefficients, self.values, inputs, moment)
+        return SimulatedHamiltonian(self.equations, self.coefficients, self.values, inputs, moment, self.switches)
 
     def moment(self, t: Float[Array, ""], width: Float[Array, ""] | float) -> Moment:
         """What depends on time alone.
@@ -193,7 +222,7 @@ class Simulated(eqx.Module):
         parameters = jnp.concatenate([self.parameters[:n] * factor, self.parameters[n:]])
         none = jnp.zeros_like(of(FORCING))
         push = jax.lax.cond(self.switches.forcing, lambda _: self._oscillation(FORCING, t), lambda _: none, t)
-        return Moment(t, parameters, push)
+        return Moment(t, jnp.asarray(width, t.dtype), parameters, push)
 
     def _oscillation(self, effect: Effect, t: Array) -> Float[Array, " target"]:
         cosine, sine, omega = self.values[effect.name, None]

@@ -10,7 +10,7 @@ from symplearn._augmented_flow import SimulatedFlow, SimulatedReading, Span
 from symplearn._augmented_system import Switches
 
 SPAN = Span(jnp.asarray(0.2), jnp.asarray(0.02), jnp.zeros((1, 0)), jnp.asarray(50))
-WITHOUT = Switches(friction=False, impulses=False, delays=False, forcing=False, changes=False)
+WITHOUT = Switches(friction=False, impulses=False, delays=False, forcing=False, changes=False, stops=False)
 
 
 @pytest.mark.parametrize(("built", "method"), [(SOFT, LEAPFROG), (CURVED, TAO)], ids=["separable", "nonseparable"])
@@ -36,6 +36,7 @@ def test_switching_off_what_is_absent_changes_nothing(built, method):
         ("periodic_forcing", "q", {"a": 0.3, "omega": 2.0, "phi": 0.4}),
         ("parametric_modulation", "a", {"a": 0.3, "omega": 2.0, "phi": 0.4}),
         ("regime_change", "a", {"d": 0.3, "t_star": 0.5}),
+        ("contact_stop", "q", {"k": 3.0, "a": 0.5}),
     ],
 )
 def test_what_is_switched_off_is_not_there(effect, target, values):

@@ -14,11 +14,11 @@ import integrators as ig
 from .._augmented import Equations
 from .._augmented_flow import SimulatedFlow, SimulatedReading, Span
 from .._augmented_system import EVERYTHING, Switches
-from .._effects import COULOMB, DELAY, FORCING, IMPULSE, MODULATION, REGIME
+from .._effects import COULOMB, DELAY, FORCING, IMPULSE, MODULATION, REGIME, STOP
 from ._problem import Combination, Problem
 
 # Effects whose work is left out where no lane has one of them, by the switch that they share.
-_SWITCHED = ((COULOMB,), (IMPULSE,), (DELAY,), (FORCING,), (MODULATION, REGIME))
+_SWITCHED = ((COULOMB,), (IMPULSE,), (DELAY,), (FORCING,), (MODULATION, REGIME), (STOP,))
 
 
 class Course(eqx.Module):
@@ -102,6 +102,5 @@ def _touched(equations: Equations) -> tuple[Bool[np.ndarray, "switch coefficient
     """The first coefficient of every effect of a switch, and whether it is on whatever they are."""
     own = np.zeros((len(_SWITCHED), equations.size), bool)
     for k, effects in enumerate(_SWITCHED):
-        for effect in effects:
-            own[k, equations.firsts(effect)] = True
+        own[k, [c.first for c in equations.candidates if c.effect in effects]] = True
     return own, np.array([IMPULSE in effects and bool(equations.jumping) for effects in _SWITCHED])

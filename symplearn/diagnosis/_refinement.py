@@ -82,6 +82,18 @@ class Refinement:
             self.progress("moving stiffness between what is seen and what is not")
             self.weigher.weigh([*starts, *driven], whole=True)
 
+    def move_stops(self, size: int) -> None:
+        """Try the best of a size that have a stop with it harder and nearer to the edge, or the reverse."""
+        starts = []
+        for c in self._near(size)[:_MOVED]:
+            white = self.found.of(c, "white")
+            assert white is not None  # every combination is weighed under white noise first
+            stops = [m for m in c if self.problem.candidate(m).effect is STOP]
+            starts += [Start(c, z, 0.0) for m in stops for z in along_the_depths(self.weigher, c, white.z, m)]
+        if starts:
+            self.progress("moving stops")
+            self.weigher.weigh(starts, whole=True)
+
     def cross_gaps(self, size: int) -> None:
         """Try the best of a size from where fits lead that were found gap by gap."""
         some = [self.weigher.base] if size == 0 else self._near(size)[:_MOVED]

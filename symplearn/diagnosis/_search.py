@@ -88,6 +88,7 @@ class Search:
             else:
                 break
             if self.in_time():
+                self.refinement.move_stops(size)
                 self.refinement.move_modes(size)
                 self.refinement.cross_gaps(size)
             if size > 1 and not self._gained(size):
