@@ -207,6 +207,26 @@ def test_conservative_effects_leave_the_flow_symplectic(effect):
     assert (np.abs(J[0, 2]) > 1e-2) == (effect == "hidden_oscillator")
 
 
+def test_slopes_do_not_jump_where_a_substep_enters_a_stop():
+    """After one bounce off a stop of six substeps, dq/da is that of DOP853's solutions within 5 %, wherever in a
+    substep the stop lies; 2.8 % was seen, and 99 % by the force of an instant."""
+    places, h = np.linspace(0.2, 0.225, 11), 1e-4
+
+    def numeric(a):
+        values = vector(SOFT, "contact_stop", {"k": 200.0, "a": 0.0}, side="upper")
+        along = np.zeros_like(values)
+        along[candidate(SOFT, "contact_stop", side="upper").first + 1] = 1.0
+        end = lambda a: flow(SOFT, LEAPFROG, values + a * along, widened([0.0, 1.0]), 0.0, 0.05, 24)[0]  # noqa: E731
+        return jax.jvp(end, (jnp.asarray(a),), (jnp.ones(()),))[1]
+
+    def true(a):
+        rates = lambda t, x: [x[1] / MASS, -A * np.sinh(x[0]) - 200.0 * max(x[0] - a, 0.0)]  # noqa: E731
+        return solved(rates, [0.0, 1.0], np.array([0.0, 1.2]), 1e-11)[-1, 0]
+
+    expected = [(true(a + h) - true(a - h)) / (2 * h) for a in places]
+    np.testing.assert_allclose([numeric(a) for a in places], expected, rtol=0.05)
+
+
 def test_dry_friction_takes_the_same_from_every_half_swing():
     """A spring with dry friction loses 2 f / k of amplitude each half period, the closed form, and moves as fast."""
     half = np.pi * np.sqrt(MASS / A)
