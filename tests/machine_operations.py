@@ -34,6 +34,7 @@ OF_ONE = {
     "not": lambda x: jnp.where(~(x > 0), x, 2 * x),
     "finite_or_zero": lambda x: jax.grad(lambda y: jnp.sum(guard(y) ** 2))(x) + 1.0,
     "stop_gradient": lambda x: x * lax.stop_gradient(x),
+    "floor": lambda x: jnp.floor(3.0 * x) * x,
     "is_finite": lambda x: jnp.where(jnp.isfinite(1 / (x - 0.7)), x, 2.0),
     "convert_element_type": lambda x: x * (x > 0) + (x > 0).astype(int).astype(float) + (3 * x).astype(int),
 }  # fmt: skip
