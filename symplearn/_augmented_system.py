@@ -32,7 +32,7 @@ from ._effects import (
     Effect,
 )
 
-# Logarithm of two speeds between which a stop is stepped alike.
+# Logarithm of the ratio of two speeds between which a stop is stepped alike.
 _OCTAVE = math.log(2.0)
 # The values of an effect by target, by its name and side; a tuple over its values.
 Values = Mapping[tuple[str, str | None], tuple[Float[Array, " target"], ...]]
@@ -172,8 +172,8 @@ class SimulatedHamiltonian(ig.AbstractHamiltonian):
 
 
 def _octave(v: Float[Array, " d"]) -> Float[Array, " d"]:
-    """Speeds rounded up to a power of two: a force that goes with them but in steps is one that no velocity enters, and
-    its flow is symplectic."""
+    """Speeds rounded up to a power of two. A force that goes with the speed itself has no potential, and pumps a motion
+    that bounces; between two such steps this one has, and its flow is symplectic there."""
     return jnp.exp(_OCTAVE * (jnp.floor(jnp.log(jax.lax.stop_gradient(jnp.abs(v))) / _OCTAVE) + 1.0))
 
 

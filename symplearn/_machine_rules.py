@@ -262,7 +262,7 @@ RULES: dict[str, _Rule] = {
     "eq": _compared("=="),
     "exp": _smooth("exp", lambda on, x, f: f),
     "finite_or_zero": lambda on, p, a: Dual(_cleaned(on, a.value), None if a.slope is None else _cleaned(on, a.slope)),
-    "floor": lambda on, p, a: Dual(on.called("floor", a.value)),
+    "floor": lambda on, p, a: Dual(on.built_in("floor", a.value)),
     "ge": _compared(">="),
     "gt": _compared(">"),
     "integer_pow": _integer_power,

@@ -17,8 +17,8 @@ from ._problem import Problem
 # Prior scale of an effect: its force against the forces already there, its error against the reading, its change of a
 # parameter against the parameter. Readings count from zero, which is the sensor's: a bias errs as much as a scale does.
 STRENGTH = 0.3
-# A stop bears the forces already there at this share of the motion's range, or softer: most are far harder than what
-# swings, and a narrow prior would make them softer than they are.
+# A stop bears the forces already there at this share of the motion's range, over `STRENGTH`, or softer: at a ten
+# thousandth. A prior that hard stops do not fit in makes them softer than they are; orders of magnitude cost little.
 _DEPTH = 3e-5
 # Root mean square over the recording of what grows evenly to one, and of what is one in half of it: their inverses.
 _EVEN, _HALF = np.sqrt(3.0), np.sqrt(2.0)

@@ -40,6 +40,8 @@ class Refinement:
     def __init__(self, prospects: Prospects, progress: Callable[[str], None]):
         self.prospects, self.progress = prospects, progress
         self.weigher: Weigher = prospects.weigher
+        # Fits of combinations with a stop whose stops were moved.
+        self._stopped_at: dict[Combination, np.ndarray] = {}
 
     @property
     def found(self) -> Found:
@@ -59,11 +61,10 @@ class Refinement:
             white = self.found.of(c, "white")
             assert white is not None  # every combination is weighed under white noise first
             starts += [] if white.converged else [Start(c, white.z, 0.0)]
+            starts += self._with_stops_moved(c) if k < _MOVED else []
             for member, place in self.problem.placed(c) if k < _MOVED else []:
                 effect = self.problem.candidate(member).effect
-                if effect is STOP:
-                    starts += [Start(c, z, 0.0) for z in along_the_depths(self.weigher, c, white.z, member)]
-                elif effect.places:
+                if effect.places and effect is not STOP:
                     starts += [Start(c, z, 0.0) for z in self._moved(white.z, member, place.stop - 1)]
         if starts:
             self.progress("moving times, thresholds and frequencies")
@@ -84,13 +85,7 @@ class Refinement:
 
     def move_stops(self, size: int) -> None:
         """Try the best of a size that have a stop with it harder and nearer to the edge, or the reverse."""
-        starts = []
-        for c in self._near(size)[:_MOVED]:
-            white = self.found.of(c, "white")
-            assert white is not None  # every combination is weighed under white noise first
-            stops = [m for m in c if self.problem.candidate(m).effect is STOP]
-            starts += [Start(c, z, 0.0) for m in stops for z in along_the_depths(self.weigher, c, white.z, m)]
-        if starts:
+        if starts := [start for c in self._near(size)[:_MOVED] for start in self._with_stops_moved(c)]:
             self.progress("moving stops")
             self.weigher.weigh(starts, whole=True)
 
@@ -202,6 +197,17 @@ class Refinement:
     def _mine(self) -> list[Combination]:
         """Combinations that the outliers which were taken out are part of."""
         return [c for c in self.found.estimates if set(self.weigher.base) <= set(c)]
+
+    def _with_stops_moved(self, combination: Combination) -> list[Start]:
+        """A fitted combination with each of its stops harder or softer; nothing once more from the same fit."""
+        white = self.found.of(combination, "white")
+        assert white is not None  # every combination is weighed under white noise first
+        stops = [m for m in combination if self.problem.candidate(m).effect is STOP]
+        if not stops or np.array_equal(self._stopped_at.get(combination, ()), white.z):
+            return []
+        self._stopped_at[combination] = white.z
+        moved = [z for m in stops for z in along_the_depths(self.weigher, combination, white.z, m)]
+        return [Start(combination, z, 0.0) for z in moved]
 
     def _moved(self, z: np.ndarray, member: int, entry: int) -> list[np.ndarray]:
         one, priors = self.problem.candidate(member), self.found.priors
