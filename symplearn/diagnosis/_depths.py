@@ -17,7 +17,7 @@ _SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 2.0)
 # times the depth to this power.
 _IMPULSE = 1.5
 # What bounces off a stop at speed v comes v / sqrt(k) deep, and back as from a wall this many times as deep.
-_BOUNCE, _WALL = 2.0, np.pi / 2
+_BOUNCE, WALL = 2.0, np.pi / 2
 
 
 def along_the_depths(
@@ -33,7 +33,7 @@ def along_the_depths(
     depth = np.max(q - a) if one.side == "upper" else np.min(q - a)  # below a lower stop: less than nothing
     low, high = weigher.found.priors.lower[one.values.stop - 1], weigher.found.priors.upper[one.values.stop - 1]
     found = []
-    for power, reach in ((_IMPULSE, 1.0), (_BOUNCE, _WALL)):
+    for power, reach in ((_IMPULSE, 1.0), (_BOUNCE, WALL)):
         for share in _SHARES if np.isfinite(depth) and k > 0 else ():
             moved = z.copy()
             moved[place] = k * share**-power, a + reach * (1 - share) * depth

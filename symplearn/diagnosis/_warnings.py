@@ -9,6 +9,7 @@ import numpy as np
 from .._recording import Recording
 from .._simulation_records import SimulationFile
 from ._found import Found
+from ._hard_stops import hardly_entered
 from ._law_text import moment
 from ._locate import spell_windows
 from ._nameless import is_clear
@@ -94,7 +95,7 @@ def warnings(
         when = _when(problem, recordings, chosen.best)
         out.append(f"a remainder without a name is left beside the findings: {_REMAINDERS[chosen.best.kind]}{when}")
     if chosen is not None:
-        out += in_tune(problem, after)
+        out += in_tune(problem, after) + hardly_entered(with_)
     if chosen is not None and any(o.estimate.bends for o in with_):
         out.append("what is known of that error is part of the readings that are expected with the findings; "
                    "augmented.toml does not have it")  # fmt: skip
