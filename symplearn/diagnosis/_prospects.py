@@ -70,13 +70,14 @@ class Prospects:
         self, combination: Combination, most: int, size: int, number: int, beside: Estimate | None = None
     ) -> list[Start]:
         """Combinations of a size, at most so many, that may do as well as a fitted one, whose members they need not
-        have: of all effects without a place, and of others where one more of them helps most. `beside` the remainder
-        of an estimate, if any: those too that were weighed without it."""
+        have: of all effects without a place, in all recordings or in the same as one of its members, and of others
+        where one more of them helps most. `beside` the remainder of an estimate, if any: those too that were weighed
+        without it."""
         w, fits = self.weigher, self._fitted(combination)
         if fits is None:
             return []
         problem = w.problem
-        units = {m: Unit(m, None) for m in problem.searched if not problem.candidate(m).effect.places}
+        units = {m: Unit(problem.whole(m), None) for m in self._without_a_place(combination)}
         for start in sorted(self.about(combination, most), key=lambda start: -start.gain)[:_EXCHANGED]:
             (member,) = set(start.combination) - set(combination)
             place = dict(problem.placed(start.combination))[member].stop - 1
@@ -90,6 +91,13 @@ class Prospects:
         regression = Regression(w.stepper, fits, w.rows, w.found.priors, some, whiten)
         known = [c for c in w.found.estimates if beside is None or w.found.of(c, beside.kind)]
         return regression.subsets(size + len(w.base), set(known).__contains__, number)
+
+    def _without_a_place(self, combination: Combination) -> list[int]:
+        """Effects without a place, in all recordings or in the same as one of a combination's members."""
+        problem = self.weigher.problem
+        plain = [m for m in problem.searched if not problem.candidate(m).effect.places]
+        same = {problem.members[m].recordings for m in combination}
+        return [*plain, *(v for m in plain for v in problem.variants(m) if problem.members[v].recordings in same)]
 
     def with_one_of(self, combination: Combination, members: Sequence[int], size: int, number: int) -> list[Start]:
         """The same of effects of a fitted one with one of some members, in all recordings or in some, that have no
