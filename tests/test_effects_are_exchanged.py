@@ -11,11 +11,16 @@ from scipy.special import logsumexp
 from test_scans_predict_evidence import FILE, MASS, NOISE, PULL_SD, SCALE, X0_SD, response
 
 from symplearn.diagnosis._calibrate import calibrate
+from symplearn.diagnosis._effect_priors import with_effects
 from symplearn.diagnosis._exchange import Regression
-from symplearn.diagnosis._score import Unit
+from symplearn.diagnosis._found import Found
+from symplearn.diagnosis._motion import motion_along
+from symplearn.diagnosis._prospects import MANY, Prospects
+from symplearn.diagnosis._score import Start, Unit
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._strength import WIDTHS
 from symplearn.diagnosis._trajectory import Stepper
+from symplearn.diagnosis._weigher import Weigher
 
 TIMES = np.linspace(0.0, 12.0, 80)
 EFFECTS = ("sensor_bias", "sensor_drift", "periodic_forcing")
@@ -154,3 +159,38 @@ def test_dry_friction_with_drag_is_found_behind_a_damping():
         truth = {"coulomb_friction": 0.004, "quadratic_drag": 0.05}[p.candidate(m).effect.name]
         # Where a fit begins, not where it ends: a linear step from a motion that is off by more than twice the noise.
         assert found[0].z[place][0] == pytest.approx(truth, rel=0.2)
+
+
+def test_what_does_the_same_in_the_same_recording_is_looked_for():
+    """Two springs in three recordings, in the second of which one is pulled; the pull there was fitted. An error of
+    the sensor's zero there does the same, so that it helps nothing beside the pull: it is looked for in its place, and
+    is as likely."""
+    times, pull, noise = np.linspace(0.0, 12.0, 60), 0.1, 0.01
+    file = cases.simulation("p**2/2 + b**2/2 + q**2 + 1.5*a**2", ("q", "a"), ("p", "b"), {"y": "q", "z": "a"})
+    runs, paths, omega = [], [], np.sqrt([2.0, 3.0])
+    for number, begin in enumerate(([1.0, 0.5], [0.7, -0.8], [-0.4, 0.9]), start=1):
+        swing = begin * np.cos(np.outer(times, omega)), -omega * begin * np.sin(np.outer(times, omega))
+        y = swing[0] + (0.0, pull / 3 if number == 2 else 0.0)
+        y += noise * np.random.default_rng(number).normal(size=y.shape)
+        runs.append(cases.recorded(times, y, number=number, columns=("y", "z")))
+        paths.append(np.concatenate([np.pad(part, ((0, 0), (0, 1))) for part in swing], axis=1))
+    p = cases.problem(file, runs, 0.05)
+    bare = priors_without_effects(p)
+    weigher = Weigher(Stepper(p), Found(p, with_effects(p, bare, motion_along(p, bare.mean, paths))))
+    there = [
+        next(m for m in range(len(p.members)) if p.members[m].recordings == (1,) and said(p.candidate(m)) == wanted)
+        for wanted in (("constant_force", "a"), ("sensor_bias", "z"))
+    ]
+    z = bare.mean.copy()
+    z[p.slots] = pull
+    weigher.weigh([Start((there[0],), z, 0.0)], whole=True)
+    starts = Prospects(weigher).exchanged((there[0],), MANY, 1, 4)
+    best = max(starts, key=lambda start: start.gain)
+    # Its prior is as wide as the pull's, in units of its own; the substep's error in the responses, which both have.
+    assert best.combination == (there[1],) and best.gain == pytest.approx(0.0, abs=1e-6)
+    # The noise of the mean of sixty readings is a twentieth of it.
+    assert best.z[p.slots] == pytest.approx(pull / 3, rel=0.15)
+
+
+def said(candidate):
+    return candidate.effect.name, candidate.target
