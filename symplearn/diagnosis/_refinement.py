@@ -255,13 +255,29 @@ class Refinement:
 
     def _shrunk(self, combination: Combination, ranked: Sequence[Combination]) -> list[Float[np.ndarray, " z"]]:
         """Where a combination begins that lacks members of a fitted one: at that one's values, and at those that the
-        others take where these do nothing: one of two effects that do nearly the same then does the work of both."""
+        others take where these do nothing: one of two effects that do nearly the same then does the work of both. Also
+        at the latter of the one that loses least, whose member is next to nothing: where a small force decides where a
+        motion ends, no other way leads back."""
         larger = next(c for c in ranked if set(combination) < set(c))
         white = self.found.of(larger, "white")
         assert white is not None
+        nearly = max(self._one_more(combination), key=lambda c: self._without(combination, c)[1], default=larger)
+        first = self.problem.carried(white.z, larger, combination)
+        others = [self._without(combination, c)[0] for c in dict.fromkeys([larger, nearly])]
+        return [first, *(z for z in others if np.isfinite(z).all() and not np.array_equal(z, first))]
+
+    def _one_more(self, combination: Combination) -> list[Combination]:
+        """What was fitted with one member more."""
+        return [c for c in self._mine() if len(c) == len(combination) + 1 and set(combination) < set(c)]
+
+    def _without(self, combination: Combination, larger: Combination) -> tuple[Float[np.ndarray, " z"], float]:
+        """The values that a combination takes where what a larger one has beside it does nothing, as far as that is
+        linear, and what is left of that one's log evidence."""
+        white = self.found.of(larger, "white")
+        assert white is not None  # every combination is weighed under white noise first
         gone = [strength_entries(self.problem, larger, member) for member in larger if member not in combination]
         some, spread = np.concatenate(gone), white.covariance
-        others = white.z - spread[:, some] @ inverse(spread[np.ix_(some, some)]) @ white.z[some]
-        others = np.clip(others, *self.found.priors.bounds_of(self.problem, larger))
-        ways = [white.z, others] if len(some) and np.isfinite(others).all() else [white.z]
-        return [self.problem.carried(z, larger, combination) for z in ways]
+        pull = inverse(spread[np.ix_(some, some)]) @ white.z[some]
+        others = np.clip(white.z - spread[:, some] @ pull, *self.found.priors.bounds_of(self.problem, larger))
+        left = white.log_evidence - 0.5 * float(white.z[some] @ pull)
+        return self.problem.carried(others, larger, combination), left if np.isfinite(left) else -np.inf
