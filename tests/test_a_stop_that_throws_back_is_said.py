@@ -13,10 +13,11 @@ from symplearn.diagnosis._weighed import Estimate
 TIMES = np.arange(0.0, 15.0, 0.05)
 
 
-def said(stiffness, side="upper", place=0.6):
+def said(stiffness, side="upper", place=0.6, every=1):
     """What is said of a stop in a spring of period pi, which runs into it at speed and is in it for half the period of
-    that: pi / sqrt(4 + k)."""
-    p = cases.problem(cases.simulation("p**2/2 + 2*q**2"), [cases.recorded(TIMES, np.cos(TIMES))], 0.005)
+    that: pi / sqrt(4 + k); one row in so many holds a reading."""
+    y = np.where(np.arange(len(TIMES)) % every == 0, np.cos(TIMES), np.nan)
+    p = cases.problem(cases.simulation("p**2/2 + 2*q**2"), [cases.recorded(TIMES, y)], 0.005)
     (member,) = [m for m in p.searched if p.candidate(m).effect.name == "contact_stop" and p.candidate(m).side == side]
     z = np.zeros(p.size)
     z[:3:2] = (-0.5, -1.6) if side == "lower" else (0.5, 1.6)
@@ -41,3 +42,9 @@ def test_a_stop_that_is_read_inside_is_not_doubted():
     """Contacts of 0.31 time units, six readings each; and a stop outside the motion, which no reading is in."""
     assert said(100.0) == []
     assert said(5000.0, place=2.0) == []
+
+
+def test_rows_without_a_reading_show_nothing_inside():
+    """The same contacts of six rows, of which one in six was read."""
+    (warning,) = said(100.0, every=6)
+    assert "upper contact stop" in warning

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Bool
 
 from .._effects import STOP
 from ._depths import WALL
@@ -23,8 +24,8 @@ def hardly_entered(outlooks: Sequence[Outlook]) -> list[str]:
         if one.effect is not STOP:
             continue
         sign, a = (-1 if one.side == "lower" else 1), estimate.z[place.stop - 1]
-        mine = problem.members[member].recordings
-        depths = [sign * (o.states[:, one.place] - a) for o in outlooks if o.recording in mine]
+        mine = [o for o in outlooks if o.recording in problem.members[member].recordings]
+        depths = [sign * (o.states[_read(o), one.place] - a) for o in mine]
         inside = [depth > 0 for depth in depths]
         stays = sum(np.count_nonzero(np.diff(some, prepend=False) & some) for some in inside)
         if stays and sum(map(np.sum, inside)) < _SEEN * stays:
@@ -35,3 +36,8 @@ def hardly_entered(outlooks: Sequence[Outlook]) -> list[str]:
                 "are taken faster would tell"
             )
     return out
+
+
+def _read(outlook: Outlook) -> Bool[np.ndarray, " fitted"]:
+    """Which fitted rows hold a reading; long gaps are filled with rows that do not."""
+    return ~np.isnan(outlook.rows.readings[: outlook.rows.fitted]).all(axis=1)
