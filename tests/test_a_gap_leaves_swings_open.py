@@ -19,6 +19,7 @@ def gapped(seed, *ends):
     return np.sort(np.concatenate([rng.uniform(end - 10.0, end, 40) for end in ends])), rng
 
 
+@pytest.mark.slow
 def test_a_weak_damping_is_found_across_gaps():
     """A pendulum, read for ten units of time, again after ninety swings and again after nearly two hundred: by SciPy
     with a damping of 0.002. It is told within its interval, and the held-out rows are missed by the noise."""

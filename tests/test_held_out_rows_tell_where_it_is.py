@@ -78,6 +78,7 @@ def orbit(x, times):
     return cases.solved(cases.attracted(x[4]), x[:4], np.union1d(0.0, times))[-len(times) :]
 
 
+@pytest.mark.slow
 def test_a_forecast_goes_on_with_the_attraction_that_its_end_belongs_to():
     """Of an orbit whose attraction is free, size and period being known better than either tells of it: the forecast is
     that of SciPy's least squares on all rows to a third of the noise; from the same end under the attraction of the

@@ -236,6 +236,7 @@ def is_program(part):
     return isinstance(part, ClosedJaxpr | Jaxpr)
 
 
+@pytest.mark.slow
 def test_depth_grows_as_the_logarithm():
     """Twice the readings take one round more, in value and gradient; sequentially they take twice the operations."""
 
