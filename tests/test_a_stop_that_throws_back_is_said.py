@@ -34,7 +34,7 @@ def test_less_than_two_readings_inside_are_said(side, place):
     speed = np.sqrt(1.6**2 + 4 * (0.5**2 - 0.6**2))
     wall = float(warning.split("up to ")[1].split(";")[0])
     assert f"{side} contact stop on q" in warning
-    # The deepest of the readings is not the turning place itself: 0.001 short of it was seen.
+    # The deepest of the readings is short of where the motion turns, and four digits are told: 0.0011 was seen.
     assert wall == pytest.approx(np.sign(place) * (0.6 + speed * 0.5 * np.pi / np.sqrt(5004.0)), abs=0.003)
 
 

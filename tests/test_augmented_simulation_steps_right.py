@@ -224,7 +224,7 @@ def test_slopes_do_not_jump_where_a_substep_enters_a_stop():
         return solved(rates, [0.0, 1.0], np.array([0.0, 1.2]), 1e-11)[-1, 0]
 
     expected = [(true(a + h) - true(a - h)) / (2 * h) for a in places]
-    # Order two in substeps of a sixth of the contact; the force of an instant misses by a whole substep's impulse.
+    # Order two in substeps of a sixth of the contact: what was seen, and as much again.
     np.testing.assert_allclose([numeric(a) for a in places], expected, rtol=0.05)
 
 
@@ -238,8 +238,8 @@ def test_slopes_do_not_jump_where_a_substep_enters_a_stop():
 )
 def test_a_stop_neither_heats_nor_cools(built, method, energy, most):
     """Over 1e5 substeps of bounces, some six of them to a contact, the energy apart from the stop stays near its first
-    value and its trend comes to less than a quarter of that: by a force of the speed itself it fell by a fifth, by that
-    of an instant it rose by 8 %."""
+    value and its trend comes to less than a quarter of that. Where H is separable it fell by a fifth by a force of
+    the speed itself, and rose by 8 % by that of an instant."""
     run = SimulatedFlow(
         built, method, jnp.array([MASS, A]),
         jnp.asarray(vector(built, "contact_stop", {"k": 200.0, "a": 0.2}, side="upper")),

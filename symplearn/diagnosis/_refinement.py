@@ -261,9 +261,10 @@ class Refinement:
         larger = next(c for c in ranked if set(combination) < set(c))
         white = self.found.of(larger, "white")
         assert white is not None
-        nearly = max(self._one_more(combination), key=lambda c: self._without(combination, c)[1], default=larger)
         first = self.problem.carried(white.z, larger, combination)
-        others = [self._without(combination, c)[0] for c in dict.fromkeys([larger, nearly])]
+        without = {c: self._without(combination, c) for c in (larger, *self._one_more(combination))}
+        nearly = max(without, key=lambda c: without[c][1])
+        others = [without[c][0] for c in dict.fromkeys([larger, nearly])]
         return [first, *(z for z in others if np.isfinite(z).all() and not np.array_equal(z, first))]
 
     def _one_more(self, combination: Combination) -> list[Combination]:
