@@ -6,8 +6,10 @@ import pytest
 import report_cases
 from finding_cases import MOMENTA, TARGETS, UNITS
 
+from symplearn._simulation_file import parse_simulation
 from symplearn._vocabulary import VOCABULARY
 from symplearn.diagnosis._units import coefficient_units
+from symplearn.diagnosis._warnings import idle_units
 from symplearn.report._units import coefficient_unit
 
 EXPECTED = {
@@ -99,3 +101,41 @@ def test_units_in_the_report_follow_from_the_law():
     assert coefficient_unit({"effect": "sensor_gain", "target": "angle_deg"}, record, "g") == ""
     unknown = dataclasses.replace(record, units={"theta": "m"})
     assert coefficient_unit({"effect": "viscous_damping", "target": "theta"}, unknown, "c") is None
+
+
+def test_a_unit_of_nothing_is_told():
+    """A unit of a name that the simulation does not have is a warning; of every kind of name that it has, none."""
+    file = parse_simulation(
+        """
+[system]
+coordinates = ["x"]
+momenta = ["p"]
+hamiltonian = "p**2/(2*m) + x**2/2"
+[parameters]
+m = 1.0
+[forces]
+p = "u"
+[recording]
+time = "t_s"
+inputs = ["u"]
+group = "run"
+where = { ball = "tennis" }
+[recording.observe]
+x_m = "x"
+[units]
+x = "m"
+p = "kg m/s"
+m = "kg"
+u = "N"
+x_m = "m"
+xm = "m"
+t = "s"
+t_s = "s"
+H = "J"
+run = "1"
+ball = "1"
+""",
+        "units.toml",
+    )
+    [said] = idle_units(file)
+    assert said.startswith("[units] has xm, which is no column")

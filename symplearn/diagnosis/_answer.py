@@ -34,7 +34,7 @@ from ._record import Diagnosis, Forecast, Series
 from ._told import Told
 from ._trajectory import Stepper
 from ._units import coefficient_units, time_unit
-from ._warnings import doubled, missed, set_back, warnings
+from ._warnings import doubled, idle_units, missed, set_back, warnings
 from ._weighed import Estimate, coloured_inflation
 from ._words import equation_lines, finding_sentence
 
@@ -164,6 +164,7 @@ class Answer:
             "next_measurement": self._next(),
             "warnings": [*self.notes]
             + doubled(self.file)
+            + idle_units(self.file)
             + warnings(
                 self.problem,
                 self.recordings,

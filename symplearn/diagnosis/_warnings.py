@@ -178,6 +178,18 @@ def doubled(file: SimulationFile) -> list[str]:
     return list(dict.fromkeys(out))
 
 
+def idle_units(file: SimulationFile) -> list[str]:
+    """Which names of [units] are no quantity of the simulation, and so are shown nowhere."""
+    r = file.recording
+    known = {*file.states, *file.parameters, *r.inputs, *r.observe, r.time, *r.group, *r.where, "t", "H"}
+    return [
+        f"[units] has {name}, which is no column, coordinate, momentum, parameter or input of the simulation: "
+        "it is shown nowhere"
+        for name in file.units
+        if name not in known
+    ]
+
+
 def _when(problem: Problem, recordings: Sequence[Recording], best: Estimate) -> str:
     """From when to when a remainder acts that does not always."""
     acts = spell_windows(problem, best.exposures) if best.exposures is not None else []
