@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
@@ -55,14 +56,15 @@ class Rows:
 
 
 def lay_out(
-    recordings: Sequence[HasRows], holdout: float, width: float, substep: float, shorten: bool = False
+    recordings: Sequence[HasRows], holdout: float, width: float, substep: float, is_begun: bool = True
 ) -> list[Rows]:
     """Thin recordings into bins of `width`, split off the held-out parts, and lay spans of at most `substep`.
 
-    All recordings get the same number of substeps per span, so that one compiled function serves them all. `shorten`
-    leaves out the first rows of a recording that holds more than can be fitted in minutes, even after thinning.
+    All recordings get the same number of substeps per span, so that one compiled function serves them all. Where the
+    state at the first row is known (`is_begun`), that row stays as it is; where not, the first rows of a recording that
+    holds more than can be fitted in minutes, even after thinning, are left out.
     """
-    thinned = [_thinned(recording, holdout, width, shorten) for recording in recordings]
+    thinned = [_thinned(recording, holdout, width, is_begun) for recording in recordings]
     pieces = max(math.ceil(np.median(np.diff(rows.times)) / substep - 1e-9) for rows, _ in thinned)
     return [
         _one(recording, rows, first, max(1, pieces), holdout)
@@ -74,15 +76,16 @@ def _fitted_count(n: int, holdout: float) -> int:
     return max(n - math.floor(n * holdout + 1e-9), 2)
 
 
-def _thinned(recording: HasRows, holdout: float, width: float, shorten: bool) -> tuple[Thinned, int]:
+def _thinned(recording: HasRows, holdout: float, width: float, is_begun: bool) -> tuple[Thinned, int]:
     """Fitted and held-out rows thinned apart, end to end, and how many of them are fitted."""
     n = len(recording.times)
     keep = _fitted_count(n, holdout)
-    parts = [thin(recording.times[a:b], recording.readings[a:b], width) for a, b in ((0, keep), (keep, n)) if b > a]
-    late = slice(max(0, len(parts[0].times) - _LONGEST) if shorten else 0, None)
-    parts[0] = Thinned(parts[0].times[late], parts[0].readings[late], parts[0].counts[late])
-    joined = (np.concatenate([getattr(part, f) for part in parts]) for f in ("times", "readings", "counts"))
-    return Thinned(*joined), len(parts[0].times)
+    begin = [0, 1, keep] if is_begun else [0, keep]
+    parts = [thin(recording.times[a:b], recording.readings[a:b], width) for a, b in pairwise([*begin, n]) if b > a]
+    fitted = sum(len(part.times) for part in parts[: len(begin) - 1])
+    late = 0 if is_begun else max(0, fitted - _LONGEST)
+    joined = (np.concatenate([getattr(part, f) for part in parts])[late:] for f in ("times", "readings", "counts"))
+    return Thinned(*joined), fitted - late
 
 
 def _one(recording: HasRows, rows: Thinned, first: int, pieces: int, holdout: float) -> Rows:
@@ -103,7 +106,7 @@ def _one(recording: HasRows, rows: Thinned, first: int, pieces: int, holdout: fl
 
 
 def bin_width(recordings: Sequence[HasRows]) -> float:
-    """One width for all recordings: the narrowest that any of them that needs thinning asks for."""
+    """One width for all recordings: the narrowest that any of them that needs thinning asks for; 0 for none."""
     widths = [thinning_width(r.times, r.readings) for r in recordings]
     return min((w for w in widths if w > 0), default=0.0)
 

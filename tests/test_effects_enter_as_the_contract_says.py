@@ -203,3 +203,15 @@ def test_a_delay_is_of_order_four():
         errors.append(np.sqrt(((found - earlier) ** 2).mean()))
     # The next order's share at these delays is a half.
     assert 2**4.2 < errors[0] / errors[1] < 2**6 and errors[1] < 1e-4
+
+
+def test_a_delay_of_half_a_swing_is_gone_back():
+    """What a sensor showed as late as half a small swing's period is still the swing of that time."""
+    tau = np.pi / np.sqrt(A / MASS)
+    states = solved(soft(), START, TIMES, 1e-12)
+    back = solved(soft(), START, np.array([0.0, -tau]), 1e-12)[-1]
+    earlier = solved(soft(), back, np.concatenate([[-tau], TIMES - tau + 1e-12]), 1e-12)[1:, 0]
+    found = shown(vector(SOFT, "sensor_delay", {"tau": tau}), states)[:, 0]
+    # Eight steps of a method of order four, each 0.4 of a radian: (pi / 8)^5 / 120 each, and more where it swings wide.
+    np.testing.assert_allclose(found, earlier, atol=5e-3)
+    assert np.abs(earlier - states[:, 0]).max() > 1.0

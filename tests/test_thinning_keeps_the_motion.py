@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 from symplearn._rows import bin_width, lay_out
+from symplearn._simulation_file import parse_simulation
 from symplearn._thinning import highest_frequency, thin, thinning_width
+from symplearn.diagnosis._build import averaged_over
 from symplearn.diagnosis._calibrate import THINNED
 
 DENSE = 20_000
@@ -148,6 +150,38 @@ def test_no_bin_straddles_the_boundary(holdout):
     changed[kept:] += 5.0
     (other,) = lay_out([cases.recorded(run.times, changed)], holdout, bin_width([run]), 0.05)
     np.testing.assert_array_equal(other.readings[: rows.fitted], rows.readings[: rows.fitted])
+
+
+def test_a_known_start_keeps_its_row():
+    """The row at which the start is known is averaged with no other; without one its bin is like all others."""
+    run = dense_run()
+    (rows,) = lay_out([run], 0.25, bin_width([run]), 0.05)
+    assert rows.times[0] == run.times[0] and rows.readings[0] == run.readings[0] and rows.counts[0] == 1
+    assert rows.counts[1] > 5 and rows.counts.sum() == DENSE
+    (free,) = lay_out([run], 0.25, bin_width([run]), 0.05, is_begun=False)
+    assert free.times[0] > run.times[0] and free.counts[0] > 5 and free.counts.sum() == DENSE
+
+
+def test_readings_of_an_input_are_not_averaged():
+    """Where an input is part of a reading it may change from row to row, and every row is taken by itself."""
+    observed = {"q": 'y = "q"', "q + u / 2": 'y = "q + u/2"'}
+    widths = {}
+    for name, line in observed.items():
+        text = f"""
+[system]
+coordinates = ["q"]
+momenta = ["p"]
+hamiltonian = "p**2/2 + q**2/2"
+[forces]
+p = "u"
+[recording]
+time = "t"
+inputs = ["u"]
+[recording.observe]
+{line}
+"""
+        widths[name] = averaged_over(parse_simulation(text, "fed.toml"), [dense_run()])
+    assert widths["q"] == bin_width([dense_run()]) > 0 == widths["q + u / 2"]
 
 
 def test_wide_gaps_are_bridged():

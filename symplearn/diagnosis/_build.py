@@ -13,7 +13,7 @@ from .._effects import DELAY, EFFECTS, ERROR, HIDDEN, NOISE, OUTLIERS, UNNAMED, 
 from .._errors import InputError, nearest, shown
 from .._expression import symbol
 from .._recording import Recording
-from .._rows import Rows, bin_width, lay_out
+from .._rows import HasRows, Rows, bin_width, lay_out
 from .._simulation_records import Quantity, SimulationFile
 from .._symbolic import TooLarge
 from .._terms import mechanics, noise_factor
@@ -109,7 +109,7 @@ def build(
 ) -> Problem:
     """Lay the recordings out and gather every prior."""
     # A prior of the initial state belongs to the first row, which must then stay.
-    rows = tuple(lay_out(recordings, holdout, bin_width(recordings), substep, shorten=not file.initial))
+    rows = tuple(lay_out(recordings, holdout, averaged_over(file, recordings), substep, is_begun=bool(file.initial)))
     parameters, known, calibrated = _values(file, built, len(recordings))
     return Problem(
         equations=built,
@@ -128,6 +128,13 @@ def build(
         units=dict(file.units),
         known_outliers=tuple(j for j, c in enumerate(built.columns) if _has_outliers(file, c)),
     )
+
+
+def averaged_over(file: SimulationFile, recordings: Sequence[HasRows]) -> float:
+    """How far readings are averaged; not at all where an input is part of one: it may change from row to row."""
+    inputs = {file.symbols[name] for name in file.recording.inputs}
+    is_fed = any(inputs & seen.tree.free_symbols for seen in file.recording.observe.values())
+    return 0.0 if is_fed else bin_width(recordings)
 
 
 def _has_outliers(file: SimulationFile, column: str) -> bool:
