@@ -31,6 +31,15 @@ def test_what_was_wrapped_comes_back(observe, turn):
     assert np.array_equal(np.isnan(found), np.isnan(angle)) and f"({turn:.6g})" in told[0]
 
 
+def test_a_sensor_term_of_a_column_of_the_same_name_leaves_an_angle_be():
+    """A bias of the column q is no force on the coordinate q."""
+    bias = '[[terms]]\neffect = "sensor_bias"\ntarget = "q"\nb = 0.15'
+    file = cases.simulation(ROTOR, observe={"q": "q"}, more=bias)
+    angle = 2 * np.pi * (0.3 + 0.45 * TIMES)
+    found, told = turned(angle % (2 * np.pi), file)
+    assert np.ptp(found - angle) < 1e-9 and len(told) == 1
+
+
 def test_what_is_kept_within_a_turn_loses_what_stands_beside_a_jump():
     """Of a reading that the simulation itself wraps."""
     angle = np.angle(np.exp(1j * 0.45 * 2 * np.pi * TIMES))

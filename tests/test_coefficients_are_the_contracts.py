@@ -8,8 +8,24 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from symplearn._effects import EFFECTS, Oscillating
-from symplearn.diagnosis._coefficients import _counted, _summary
+from symplearn._recording import Recording
+from symplearn._simulation_file import parse_simulation
+from symplearn.diagnosis._build import Restriction, augmented_equations, build
+from symplearn.diagnosis._calibrate import Priors
+from symplearn.diagnosis._coefficients import _counted, _summary, coefficients
 from symplearn.diagnosis._scatter import outliers
+from symplearn.diagnosis._weighed import Estimate
+
+SWING = """
+[system]
+coordinates = ["q"]
+momenta = ["p"]
+hamiltonian = "p**2/2 + 2*q**2"
+[recording]
+time = "t"
+[recording.observe]
+y = "q"
+"""
 
 AMOUNT = st.floats(1e-3, 1e3)
 FREQUENCY = st.floats(1e-2, 1e2)
@@ -69,13 +85,36 @@ def test_one_set_of_values_or_many(effect):
 
 
 @pytest.mark.parametrize("middle", [0.5, 3.1, -3.1])
-def test_an_interval_of_a_phase_is_about_its_mean(middle):
-    """Where the phase turns over at pi, mean and interval are of the same turn."""
-    draws = np.random.default_rng(0).normal(middle, 0.2, 4000)
-    told = _summary(math.remainder(middle + 0.4, 2 * math.pi), np.angle(np.exp(1j * draws)), circular=True)
-    # Of 4000 draws mean and quantiles are known to 0.003 and 0.008; held to six and four times that.
-    assert abs(math.remainder(told["mean"] - middle, 2 * math.pi)) < 0.02 and -math.pi < told["mean"] <= math.pi
-    assert told["interval95"] == pytest.approx([told["mean"] - 0.392, told["mean"] + 0.392], abs=0.03)
+def test_an_interval_of_a_phase_is_about_its_value(middle):
+    """Where the phase turns over at pi, value and interval are of the same turn."""
+    draws, value = np.random.default_rng(0).normal(middle, 0.2, 4000), math.remainder(middle + 0.1, 2 * math.pi)
+    told = _summary(value, np.angle(np.exp(1j * draws)), circular=True)
+    assert told["mean"] == value
+    # Of 4000 draws quantiles are known to 0.008; held to four times that.
+    assert told["interval95"] == pytest.approx([value - 0.1 - 0.392, value - 0.1 + 0.392], abs=0.03)
+
+
+@pytest.mark.parametrize("start", [0.0, 1e3, 2e4, 1.7e9])
+def test_an_oscillation_is_told_at_one_point(start):
+    """However far the clock is from zero, where phase and frequency hang together, a, omega and phi are one force's."""
+    times = start + np.arange(0.0, 20.0, 0.05)
+    file = parse_simulation(SWING, "swing.toml")
+    built = augmented_equations(file, start, origin=times[[0, -1]].mean())
+    run = Recording(1, "1", ("y",), times, np.cos(2 * (times - start))[:, None], np.arange(len(times)))
+    problem = build(file, built, [run], 0.25, 0.05, Restriction())
+    member = next(m for m in problem.searched if problem.candidate(m).effect.name == "periodic_forcing")
+    place = dict(problem.placed((member,)))[member]
+    z, covariance = np.zeros(problem.size), np.zeros((problem.size, problem.size))
+    z[place] = 1.0, 0.0, 1.3  # cos(1.3 (t - origin))
+    covariance[place, place] = np.diag([0.005, 0.005, 0.005 * np.sqrt(12) / 20]) ** 2
+    estimate = Estimate((member,), "white", z, covariance, np.array([0.01]), 0.0, True)
+    wide = np.full(built.size, np.inf)
+    priors = Priors(np.zeros(problem.size), np.zeros(problem.size), np.zeros(built.size), np.ones(built.size),
+                    -wide, wide, np.ones(2))  # fmt: skip
+    told = {name: one["mean"] for name, one in coefficients(problem, priors, estimate, member, 1.0).items()}
+    # Where omega t is 2e9 its last digit is 5e-7.
+    phase = math.remainder(told["omega"] * built.origin + told["phi"], 2 * math.pi)
+    assert abs(phase) < 2e-6 and told["a"] == pytest.approx(1.0)
 
 
 def test_what_a_few_outliers_say_has_honest_intervals():

@@ -1,5 +1,6 @@
 """The contract's coefficients of what was found, with their uncertainty."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,7 @@ def coefficients(
     draws = _drawn(problem, priors, estimate, place, inflation)
     named = one.effect.named(draws, problem.equations.origin)
     if within_bounds(problem, priors, estimate) is not estimate:  # a step about a fit may end beyond
-        values |= {name: float(np.median(named[name])) for name in values if name != "phi"}
+        values = _in_the_middle(named)
     return {name: _summary(values[name], named[name], circular=name == "phi") for name in values}
 
 
@@ -103,14 +104,18 @@ def _drawn(problem: Problem, priors: Priors, estimate: Estimate, place: slice, i
     return draws[allowed] if allowed.sum() > _DRAWS // 20 else draws
 
 
+def _in_the_middle(named: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """The draw that lies nearest to the medians of all; an angle belongs to its frequency, and has no median."""
+    plain = np.array([draws for name, draws in named.items() if name != "phi"])
+    off = (plain - np.median(plain, axis=1, keepdims=True)) / np.maximum(plain.std(axis=1, keepdims=True), 1e-300)
+    nearest = int(np.argmin((off**2).sum(0)))
+    return {name: float(draws[nearest]) for name, draws in named.items()}
+
+
 def _summary(value: float, draws: np.ndarray, circular: bool) -> dict[str, Any]:
-    """Mean, sd and interval; of an angle about its most probable value."""
-    if circular:
-        off = np.angle(np.exp(1j * (draws - value)))
-        low, high = np.quantile(off, [0.025, 0.975])
-        mean = float(np.angle(np.exp(1j * (value + off.mean()))))
-        # The interval is about that mean, not a turn away from it.
-        ends = [mean + float(end - off.mean()) for end in (low, high)]
-        return {"mean": mean, "sd": float(off.std()), "interval95": ends}
-    low, high = np.quantile(draws, [0.025, 0.975])
-    return {"mean": value, "sd": float(draws.std()), "interval95": [float(low), float(high)]}
+    """The value, sd and interval; of an angle about that value. A mean of an angle by itself would not belong to the
+    frequency that stands beside it: far from t = 0 the two hang together."""
+    about = value if circular else 0.0
+    off = np.angle(np.exp(1j * (draws - value))) if circular else draws
+    low, high = np.quantile(off, [0.025, 0.975]) + about
+    return {"mean": value, "sd": float(off.std()), "interval95": [float(low), float(high)]}

@@ -15,6 +15,7 @@ from .._effects import COULOMB, FORCING, GYROSCOPIC, IMPULSE, POWERS, QUADRATIC,
 from .._expression import symbol
 from .._recording import Recording
 from .._simulation_records import SimulationFile
+from .._vocabulary import COLUMN, PARAMETER, VOCABULARY
 
 # A step between neighbours of more than this share of a turn is one across its end, if all readings lie within a turn
 # and this share of another; a swing of most of a turn, read twice in a period, steps less far.
@@ -74,16 +75,18 @@ def _slope(file: SimulationFile, tree: sympy.Expr, angle: sympy.Symbol) -> float
 def _is_cyclic(file: SimulationFile, coordinate: str) -> bool:
     """Whether whole turns of a coordinate change nothing that moves it."""
     q = symbol(coordinate)
-    if any(coordinate in term.target and term.effect not in _PLACELESS for term in file.terms if not term.expression):
+    # A column or a parameter may have the coordinate's name.
+    pushes = [term for term in file.terms if VOCABULARY[term.effect].target not in (COLUMN, PARAMETER)]
+    if any(coordinate in term.target and term.effect not in _PLACELESS for term in pushes if not term.expression):
         return False
 
     def changed(tree: sympy.Expr) -> sympy.Expr:
         return tree.subs(q, q + 2 * sympy.pi) - tree
 
-    pushes = [*file.forces.values(), *(term.expression for term in file.terms if term.expression is not None)]
+    forces = [*file.forces.values(), *(term.expression for term in file.terms if term.expression is not None)]
     energy = changed(file.hamiltonian.tree)  # of which a constant moves nothing
     moved = [sympy.diff(energy, symbol(name)) for name in file.states]
-    return all(_is_nothing(one) for one in [*moved, *(changed(push.tree) for push in pushes)])
+    return all(_is_nothing(one) for one in [*moved, *(changed(push.tree) for push in forces)])
 
 
 def _is_nothing(tree: sympy.Expr) -> bool:
