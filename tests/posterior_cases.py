@@ -32,7 +32,7 @@ def estimate(problem, combination, log_evidence, kind="white", sd=0.01):
 
 def found(problem, *estimates):
     zero, ones = np.zeros(problem.size), np.ones(problem.equations.size)
-    out = Found(problem, Priors(zero, zero, 0 * ones, ones, -ones, ones, np.ones(2)))
+    out = Found(problem, Priors(zero, zero, 0 * ones, ones, -ones, ones, np.ones((problem.equations.declared, 2))))
     for one in estimates:
         out.add(one)
     return out

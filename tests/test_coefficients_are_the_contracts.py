@@ -110,7 +110,7 @@ def test_an_oscillation_is_told_at_one_point(start):
     estimate = Estimate((member,), "white", z, covariance, np.array([0.01]), 0.0, True)
     wide = np.full(built.size, np.inf)
     priors = Priors(np.zeros(problem.size), np.zeros(problem.size), np.zeros(built.size), np.ones(built.size),
-                    -wide, wide, np.ones(2))  # fmt: skip
+                    -wide, wide, np.ones((1, 2)))  # fmt: skip
     told = {name: one["mean"] for name, one in coefficients(problem, priors, estimate, member, 1.0).items()}
     # Where omega t is 2e9 its last digit is 5e-7.
     phase = math.remainder(told["omega"] * built.origin + told["phi"], 2 * math.pi)

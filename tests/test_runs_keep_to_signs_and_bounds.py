@@ -27,7 +27,15 @@ def bounded(p, member=None, low=-np.inf, high=np.inf):
     if member is not None:
         last = p.candidate(member).values.stop - 1
         lower[last], upper[last] = low, high
-    return Priors(np.zeros(p.size), np.zeros(p.size), np.zeros(size), wide, lower, upper, np.full(2, np.inf))
+    return Priors(
+        np.zeros(p.size),
+        np.zeros(p.size),
+        np.zeros(size),
+        wide,
+        lower,
+        upper,
+        np.full((p.equations.declared, 2), np.inf),
+    )
 
 
 def estimated(p, c, values, seed):

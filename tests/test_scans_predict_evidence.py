@@ -218,7 +218,7 @@ def test_a_drag_that_would_push_is_no_start(stepper, starts):
             assert s.z[p.placed(s.combination)[0][1].start] >= 0
 
 
-UNSEEN = np.array([0.4, 0.6])  # prior sd of an unseen oscillator's start
+UNSEEN = np.array([[0.4, 0.6]])  # prior sd of an unseen oscillator's start
 
 
 def driven(times, start, pull, omega):
@@ -253,7 +253,7 @@ def test_an_unseen_oscillator_that_moves_already_is_seen(stepper, priors, fits):
         ]
         still = [0 * run.times] * 2
         by_run.append([driven(run.times, x0, pull, omega), *(still * r), *pushed, *(still * (1 - r))])
-    expected = mixture(p, by_run, (0, 1), np.array([SCALE, *UNSEEN, *UNSEEN]))
+    expected = mixture(p, by_run, (0, 1), np.array([SCALE, *UNSEEN[0], *UNSEEN[0]]))
     assert p.members[start.combination[0]].recordings == (0, 1)
     # The substep's error.
     assert start.gain == pytest.approx(expected, abs=2e-3 * abs(expected)) and expected > 50

@@ -1,12 +1,13 @@
 """Trajectory fits of many combinations at once: Levenberg-Marquardt on readings and priors, in a growing window."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .._effects import IMPULSE, REGIME, Candidate
 from ._problem import Combination, Problem
 from ._trajectory import Predictions, Stepper
 
@@ -32,7 +33,9 @@ class Priors:
     """Gaussian priors of z under every combination: initial states and calibrated values, and the values of effects.
 
     `centres` and `scales` are by entry of the coefficient vector; `unseen` is the prior sd of the start of an unseen
-    oscillator. `lower` and `upper` bound where an effect may be placed, by entry of the coefficient vector.
+    oscillator, by the coordinate that it hangs on. `lower` and `upper` bound where an effect may be placed, by entry of
+    the coefficient vector; `windows`, where given, from when to when every recording is read, in which alone something
+    may happen at once.
     """
 
     mean: Float[np.ndarray, " z"]
@@ -41,8 +44,9 @@ class Priors:
     scales: Float[np.ndarray, " coefficient"]
     lower: Float[np.ndarray, " coefficient"]
     upper: Float[np.ndarray, " coefficient"]
-    unseen: Float[np.ndarray, "2"]
+    unseen: Float[np.ndarray, "coordinate 2"]
     powers: Any = None  # `Powers` of the frictions along the motion
+    windows: Float[np.ndarray, "recording 2"] | None = None
 
     def widths(self, problem: Problem) -> Float[np.ndarray, " parameter"]:
         """Standard deviations of the calibrated parameters; 0 where nothing gives a size."""
@@ -53,33 +57,52 @@ class Priors:
         """Prior precisions with the entries of a combination filled in."""
         values = self.precision.copy()
         for member, place in problem.placed(combination):
-            values[place] = self.scales[problem.candidate(member).values] ** -2.0
-            starts = problem.starts(member)
-            values[starts] = self.starts_of(starts.shape[1]) ** -2.0
+            one, starts = problem.candidate(member), problem.starts(member)
+            values[place] = self.scales[one.values] ** -2.0
+            if (when := self.when(problem, member)) is not None:
+                values[place.stop - 1] = even(*when)[1] ** -2.0
+            if one.effect.switched:
+                values[starts] = self.starts_of(one)[: starts.shape[1]] ** -2.0
         return values
 
-    def starts_of(self, number: int) -> Float[np.ndarray, " start"]:
-        """Scales of where what is unseen begins: an oscillator, or the one number of a force that fades."""
-        return self.unseen[:number]
+    def starts_of(self, one: Candidate) -> Float[np.ndarray, "2"]:
+        """Scales of where what is unseen begins: an oscillator, or a force that fades, which has the first alone."""
+        return self.unseen[one.place]
 
     def mean_of(self, problem: Problem, combination: Combination) -> Float[np.ndarray, " z"]:
         """Prior means with the entries of a combination filled in."""
-        return self._filled(problem, combination, self.mean, self.centres)
+        return self._filled(problem, combination, self.mean, self.centres, lambda low, high: even(low, high)[0])
 
     def bounds_of(self, problem: Problem, combination: Combination) -> tuple[np.ndarray, np.ndarray]:
         """Between which values each entry of z stays in a fit."""
         c, free = problem.calibrated, np.full(problem.size, np.inf)
         lower, upper = -free, free.copy()
         lower[problem.head : problem.slots], upper[problem.head : problem.slots] = c.lower, c.upper
-        lower = self._filled(problem, combination, lower, self.lower)
-        return lower, self._filled(problem, combination, upper, self.upper)
+        lower = self._filled(problem, combination, lower, self.lower, min)
+        return lower, self._filled(problem, combination, upper, self.upper, max)
 
-    @staticmethod
-    def _filled(problem: Problem, combination: Combination, z: np.ndarray, values: np.ndarray) -> np.ndarray:
+    def when(self, problem: Problem, member: int) -> tuple[float, float] | None:
+        """From when to when the recordings are read that have a member which comes at once; `None` of any other."""
+        if self.windows is None or problem.candidate(member).effect not in (IMPULSE, REGIME):
+            return None
+        mine = self.windows[list(problem.members[member].recordings)]
+        return float(mine[:, 0].min()), float(mine[:, 1].max())
+
+    def _filled(
+        self, problem: Problem, combination: Combination, z: np.ndarray, values: np.ndarray,
+        at: Callable[[float, float], float],
+    ) -> np.ndarray:  # fmt: skip
         z = z.copy()
         for member, place in problem.placed(combination):
             z[place] = values[problem.candidate(member).values]
+            if (when := self.when(problem, member)) is not None:
+                z[place.stop - 1] = at(*when)
         return z
+
+
+def even(low: float, high: float) -> tuple[float, float]:
+    """Mean and standard deviation of what may be anywhere between."""
+    return (low + high) / 2, (high - low) / np.sqrt(12)
 
 
 @dataclass(frozen=True)
@@ -119,9 +142,9 @@ def estimate_noise(
     with np.errstate(over="ignore", invalid="ignore"):  # a lane that diverged is told by its cost
         square = sum((w * x**2).sum(1) for w, x in zip(weight, r, strict=True))
     number = sum((w > 0).sum(0) for w in weight)
-    spread = np.concatenate([np.where(w > 0, rows.readings[: len(w)], np.nan)
-                             for w, rows in zip(weight, problem.rows, strict=True)])  # fmt: skip
-    floor = _FLOOR * np.maximum(np.nanmax(np.abs(spread), axis=0), 1e-300)
+    largest = [np.abs(np.nan_to_num(rows.readings[: rows.fitted])).max(0) for rows in problem.rows]
+    # A column of which nothing is read in these rows has residuals of zero, and the least noise.
+    floor = _FLOOR * np.maximum(np.max(largest, axis=0), 1e-300)
     estimated = np.maximum(np.sqrt(square / np.maximum(number, 1)), floor)
     known = np.stack([problem.noise_of(c) for c in combinations])
     return np.where(np.isnan(known), estimated, known)

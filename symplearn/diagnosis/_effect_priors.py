@@ -9,7 +9,7 @@ from jaxtyping import Float
 from .. import _effects as effects
 from .._effects import Candidate, Drag, Oscillating, PowerForce
 from ._activity import powers
-from ._calibrate import Priors
+from ._calibrate import Priors, even
 from ._memories import Span
 from ._motion import Motion, rms
 from ._problem import Problem
@@ -40,13 +40,12 @@ def with_effects(problem: Problem, priors: Priors, motion: Motion) -> Priors:
         if one.effect.places:
             place = amplitudes.stop
             low, high = _range(motion, one)
-            centres[place], scales[place] = _even(low, high)
+            centres[place], scales[place] = even(low, high)
             lower[place], upper[place] = low, high
     scales = np.where(np.isfinite(scales) & (scales > 0), scales, 1.0)
     starts = [_unseen(motion, i, _looseness(problem, priors, motion, i)) for i in range(problem.equations.declared)]
-    unseen = np.array(max(starts))
-    return replace(priors, centres=centres, scales=scales, lower=lower, upper=upper, unseen=unseen,
-                   powers=powers(problem, motion))  # fmt: skip
+    return replace(priors, centres=centres, scales=scales, lower=lower, upper=upper, unseen=np.array(starts),
+                   powers=powers(problem, motion), windows=motion.windows)  # fmt: skip
 
 
 def _looseness(problem: Problem, priors: Priors, motion: Motion, i: int) -> float:
@@ -105,10 +104,10 @@ def _pair_unit(motion: Motion, one: Candidate) -> tuple[float, ...]:
         return (push / rms(motion.v[:, i] - motion.v[:, j]),)
     if one.effect is effects.SPRING:
         return (push / rms(motion.q[:, i] - motion.q[:, j]),)
-    if one.effect is effects.GYROSCOPIC:
-        return (push / max(rms(motion.v[:, i]), rms(motion.v[:, j])),)
+    if one.effect is effects.GYROSCOPIC:  # each is pushed by the other's speed, which may be in another unit
+        return (min(motion.forces[i] / rms(motion.v[:, j]), motion.forces[j] / rms(motion.v[:, i])),)
     r = np.hypot(motion.q[:, i], motion.q[:, j])
-    return (push / rms(3 * motion.q[:, i] / np.maximum(r, 0.1 * rms(r)) ** 5),)
+    return (np.hypot(motion.forces[i], motion.forces[j]) / rms(3 * r / np.maximum(r, 0.1 * rms(r)) ** 5),)
 
 
 def _range(motion: Motion, one: Candidate) -> tuple[float, float]:
@@ -141,10 +140,5 @@ def with_nameless(
         grown["scales"][one.first : place] = scale
         if span is not None:
             grown["lower"][place], grown["upper"][place] = span.low, span.high
-            grown["centres"][place], grown["scales"][place] = _even(span.low, span.high)
+            grown["centres"][place], grown["scales"][place] = even(span.low, span.high)
     return replace(priors, **grown)
-
-
-def _even(low: float, high: float) -> tuple[float, float]:
-    """Mean and standard deviation of what may be anywhere between."""
-    return (low + high) / 2, (high - low) / np.sqrt(12)

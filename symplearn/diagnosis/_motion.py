@@ -54,6 +54,11 @@ class Motion:
         return max(float(t[-1]) for t in self.times)
 
     @property
+    def windows(self) -> Float[np.ndarray, "recording 2"]:
+        """From when to when every recording is read."""
+        return np.array([[t[0], t[-1]] for t in self.times])
+
+    @property
     def span(self) -> float:
         return self.last - self.first
 

@@ -210,7 +210,7 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
         shown = moved or bool((sd[amplitudes] < _UNINFORMED * scales).all())
         known &= moved or one.nameless is None
         if one.effect is HIDDEN:  # how it swings may be seen where how strongly it is joined is not
-            shown |= bool((sd[problem.starts(member)] < _UNINFORMED * found.priors.unseen).any())
+            shown |= bool((sd[problem.starts(member)] < _UNINFORMED * found.priors.starts_of(one)).any())
         known &= shown and not (one.effect is GAIN and abs(1.0 + best.z[place.start]) < _DEAD)
         if one.effect is HIDDEN or isinstance(one.effect, (Oscillating, Memory)):
             known &= bool(best.z[place.stop - 1] > found.priors.lower[one.values.stop - 1])

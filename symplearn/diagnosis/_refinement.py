@@ -15,7 +15,7 @@ from ._gaps import across_gaps
 from ._modes import along_the_modes
 from ._problem import MOST, Combination, Problem
 from ._prospects import MANY, Prospects
-from ._scan import spacing
+from ._scan import ends, spacing
 from ._score import Start, inverse
 from ._strength import strength_entries
 from ._weigher import KEPT, Weigher
@@ -211,7 +211,8 @@ class Refinement:
 
     def _moved(self, z: np.ndarray, member: int, entry: int) -> list[np.ndarray]:
         one, priors = self.problem.candidate(member), self.found.priors
-        low, high = priors.lower[one.values.stop - 1], priors.upper[one.values.stop - 1]
+        when = priors.when(self.problem, member)
+        low, high = ends(priors, one) if when is None else when
         step = _FADING * z[entry] if isinstance(one.effect, Memory) else spacing(one, low, high)
         out = []
         for k in (-3, -1, 1, 3):

@@ -37,17 +37,46 @@ def grid(problem: Problem, priors: Priors, candidate: int) -> list[Unit]:
     one = problem.equations.candidates[candidate]
     if not one.effect.places:
         return [Unit(candidate, None)] if one.effect.amplitudes else []
-    low, high = priors.lower[one.values.stop - 1], priors.upper[one.values.stop - 1]
-    return [Unit(candidate, float(place)) for place in _places(one, low, high)]
+    return [Unit(candidate, float(place)) for place in _tried(problem, priors, one)]
 
 
-def _places(one: Candidate, low: float, high: float) -> np.ndarray:
+def _tried(problem: Problem, priors: Priors, one: Candidate) -> np.ndarray:
+    low, high = ends(priors, one)
+    if priors.windows is None or one.effect not in (effects.IMPULSE, effects.REGIME):
+        return _places(one, low, high, max(float(np.ptp(r.times)) for r in problem.rows))
+    # Where clocks lie apart, time between them is none.
+    begins, read = _joined(priors.windows)
+    past = np.cumsum([0.0, *read])
+    at = _places(one, 0.0, float(past[-1]))
+    k = np.searchsorted(past, at, side="right") - 1
+    return begins[k] + at - past[k]
+
+
+def ends(priors: Priors, one: Candidate) -> tuple[float, float]:
+    """Between which values the place of an effect lies: of what comes at once, from zero to how long is read in all."""
+    if priors.windows is not None and one.effect in (effects.IMPULSE, effects.REGIME):
+        return 0.0, float(_joined(priors.windows)[1].sum())
+    return float(priors.lower[one.values.stop - 1]), float(priors.upper[one.values.stop - 1])
+
+
+def _joined(windows: Float[np.ndarray, "recording 2"]) -> tuple[Float[np.ndarray, " part"], Float[np.ndarray, " part"]]:
+    """When the parts of time begin in which anything is read, and how long each is."""
+    parts: list[list[float]] = []
+    for low, high in sorted(map(tuple, windows)):
+        if parts and low <= parts[-1][1]:
+            parts[-1][1] = max(parts[-1][1], high)
+        else:
+            parts.append([low, high])
+    return np.array([low for low, _ in parts]), np.array([high - low for low, high in parts])
+
+
+def _places(one: Candidate, low: float, high: float, longest: float = np.inf) -> np.ndarray:
     if isinstance(one.effect, Oscillating) or one.effect is effects.HIDDEN:
         step = spacing(one, low, high)
         number = int(min(_FREQUENCIES, np.ceil((high - low) / step)))
         # Evenly spaced as far as they go, which is what the span resolves; then ever wider.
         even = np.linspace(low, high, number)
-        return even if high - low <= step * _FREQUENCIES else np.geomspace(low, high, number)
+        return even if high - low <= max(step, resolved(longest)) * _FREQUENCIES else np.geomspace(low, high, number)
     if isinstance(one.effect, Memory):
         return np.geomspace(low, high, _FADINGS + 2)[1:-1]
     if one.effect is effects.STOP:
@@ -60,6 +89,12 @@ def spacing(one: Candidate, low: float, high: float) -> float:
     if isinstance(one.effect, Oscillating) or one.effect is effects.HIDDEN:
         return _SPACING * low * (2 if one.effect is effects.HIDDEN else 1)
     return (high - low) / _TIMES
+
+
+def resolved(longest: float) -> float:
+    """About how far apart neighbouring frequencies are where recordings, of which the longest is so long, are read by
+    clocks that lie far apart: what each resolves."""
+    return 2 * _SPACING * np.pi / longest
 
 
 def packed(problem: Problem, units: Sequence[Unit]) -> Iterator[list[Unit]]:

@@ -43,7 +43,7 @@ def priors_without_effects(problem: Problem) -> Priors:
         mean[part], precision[part] = c.mean, np.where(np.isinf(c.sd), wide, c.sd) ** -2.0
     size = problem.equations.size
     wide = np.full(size, np.inf)
-    return Priors(mean, precision, np.zeros(size), wide, -wide, wide, np.full(2, np.inf))
+    return Priors(mean, precision, np.zeros(size), wide, -wide, wide, np.full((problem.equations.declared, 2), np.inf))
 
 
 def with_states(problem: Problem, priors: Priors, paths: Sequence[Float[np.ndarray, "_ state"]]) -> Priors:
@@ -184,7 +184,8 @@ def ranked(
     for x, w in zip(residuals(problem, predictions, weight), weight, strict=True):
         number = (w > 0).sum(0)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            misfit = (number * np.log((w * x**2).sum(1) / np.maximum(number, 1))).sum(1)
+            told = number * np.log((w * x**2).sum(1) / np.maximum(number, 1))
+        misfit = np.where(number > 0, told, 0.0).sum(1)  # a column that nothing was read of tells nothing
         misfit = np.where(np.isnan(misfit), np.inf, misfit)
         out.append((np.argsort(misfit), misfit))
     return out

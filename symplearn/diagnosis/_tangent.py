@@ -15,7 +15,7 @@ from jaxtyping import Float
 from .. import _effects as effects
 from ._calibrate import Fits, Priors, by_the_noise, noise_roots, weights
 from ._problem import Problem
-from ._scan import BEST, grid, layout, packed, spacing
+from ._scan import BEST, ends, grid, layout, packed, resolved, spacing
 from ._score import Unit
 from ._stochastic import trajectories
 from ._trajectory import Stepper
@@ -132,9 +132,8 @@ def _best(problem: Problem, recordings: Sequence[_Recording], priors: Priors, ca
     alone = len(recordings) == 1
     sums = [_Sums.joined([_sums(problem, own, candidate, some, alone) for some in parts]) for own in recordings]
     scales = priors.scales[one.first : one.first + one.effect.amplitudes]
-    scales = np.concatenate([scales, priors.unseen]) if one.effect is effects.HIDDEN and alone else scales
-    ends = priors.lower[one.values.stop - 1], priors.upper[one.values.stop - 1]
-    apart = _APART * spacing(one, *map(float, ends))
+    scales = np.concatenate([scales, priors.starts_of(one)]) if one.effect is effects.HIDDEN and alone else scales
+    apart = _APART * spacing(one, *ends(priors, one))
     found: dict[int, float] = {}
     for member in [candidate, *problem.variants(candidate)]:
         which = problem.members[member].recordings
@@ -166,10 +165,11 @@ def _peaks(gains: Float[np.ndarray, " place"], places: Float[np.ndarray, " place
 def _places(problem: Problem, recordings: Sequence[_Recording], priors: Priors, candidate: int) -> np.ndarray:
     one = problem.equations.candidates[candidate]
     if one.effect in _PERIODIC:
-        ends = float(priors.lower[one.values.stop - 1]), float(priors.upper[one.values.stop - 1])
-        number = int(np.ceil((ends[1] - ends[0]) / spacing(one, *ends))) + 1
-        if number <= _FREQUENCIES:
-            return np.linspace(*ends, number)
+        low, high = ends(priors, one)
+        number = int(np.ceil((high - low) / spacing(one, low, high))) + 1
+        longest = max(float(np.ptp(own.times)) for own in recordings)
+        if number <= _FREQUENCIES or high - low <= resolved(longest) * _FREQUENCIES:
+            return np.linspace(low, high, min(number, _FREQUENCIES))
         return np.array([unit.place for unit in grid(problem, priors, candidate)])
     times = np.unique(np.concatenate([own.times[:-1] for own in recordings]))
     return times[:: max(1, -(-len(times) // _TIMES))]
