@@ -6,7 +6,7 @@ import engine_cases as cases
 import numpy as np
 import pytest
 
-from symplearn.diagnosis._ahead import look_ahead
+from symplearn.diagnosis._ahead import _squares, look_ahead
 from symplearn.diagnosis._calibrate import calibrate
 from symplearn.diagnosis._found import Found
 from symplearn.diagnosis._start import priors_without_effects
@@ -104,6 +104,23 @@ def test_it_runs_on_beside_a_clock_whether_or_not_that_fit_is_done(clear):
     lost = replace(found, ahead={drag: replace(found.ahead[drag], holds=False)}, estimates={drag: ones})
     assert coloured.log_evidence > behind.log_evidence + 5.0
     assert lost.told(drag, clock) is clock and lost.shown(drag, clock).kind == "white"
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3])
+def test_a_column_that_begins_late_has_no_part_in_what_holds(unit):
+    """Where a second column is read in the last rows alone, what holds on is told by the first, in any unit of it."""
+    y = cases.solved(lambda t, x: [x[1], -x[0]], [1.0, 0.0], TIMES) * [1.0, unit]
+    y[: int(0.85 * len(TIMES)), 1] = np.nan
+    p = cases.problem(cases.simulation("p**2/2 + q**2/2", observe={"a": "q", "b": f"{unit}*p"}),
+                      [cases.recorded(TIMES, y, columns=("a", "b"))], 0.1)  # fmt: skip
+    z, first = np.zeros((1, p.size)), [int(0.6 * len(TIMES))]
+    z[0, 0] = 0.99
+    (inside, before), (ahead, after) = _squares(Stepper(p), z, [()], ROWS, first)
+    assert before.tolist() == [True, False] and after.tolist() == [True, True]
+    # Half the square of what the start is off by: a swing's mean square.
+    assert inside[0, 0] == pytest.approx(0.01**2 / 2, rel=0.1) and ahead[0, 1] == pytest.approx(
+        inside[0, 0] * unit**2, rel=0.1
+    )
 
 
 def test_white_noise_needs_no_second_look():

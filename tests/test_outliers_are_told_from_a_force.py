@@ -1,10 +1,12 @@
 """Readings far off are left out, whatever force a path could have gone through them with; and no others."""
 
+from dataclasses import replace
+
 import engine_cases as cases
 import numpy as np
 import pytest
 
-from symplearn.diagnosis._calibrate import grow
+from symplearn.diagnosis._calibrate import grow, weights
 from symplearn.diagnosis._found import Found
 from symplearn.diagnosis._noisy import PathFit
 from symplearn.diagnosis._null_paths import null_paths
@@ -69,6 +71,24 @@ def test_under_a_noise_that_is_given_no_error_is_made_larger():
     half, tenth = (owed(share * NOISE * errors, NOISE, f"[recording.noise]\ny = {NOISE}") for share in (0.5, 0.1))
     # 0.1: no probability tells. Seen: 0.02; errors made as large as the noise were 6.6 off.
     assert half == pytest.approx(tenth, abs=0.1)
+
+
+def test_rows_that_average_many_readings_owe_no_more():
+    """The same rows, of the same errors, as averages of twenty or of four hundred readings, whose own noise is by as
+    much larger: what was taken out has the same density."""
+    readings, found = np.cos(TIMES) + NOISE * np.random.default_rng(0).normal(size=len(TIMES)), []
+    readings[FAR] += 0.05
+    out = np.zeros((len(TIMES), 1), bool)
+    out[FAR] = True
+    p = cases.problem(cases.simulation("p**2/2 + q**2/2"), [cases.recorded(TIMES, readings)], 0.25)
+    member = next(m for m in p.searched if p.candidate(m).effect.name == "sensor_outliers")
+    errors = (readings - np.cos(TIMES))[:, None] / NOISE
+    for count in (1.0, 20.0, 400.0):
+        many = replace(p, rows=(replace(p.rows[0], counts=count * p.rows[0].counts),))
+        weight = weights(many, [len(TIMES)])[0][0, 0]
+        w = Weigher(Stepper(many), Found(many, priors_without_effects(many)))
+        found.append(w._owed((member,), errors, out, np.full(1, NOISE * np.sqrt(weight))))
+    np.testing.assert_allclose(found, found[0], rtol=1e-12)
 
 
 def owed(errors, noise, more=""):

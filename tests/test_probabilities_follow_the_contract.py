@@ -114,12 +114,14 @@ def test_prices_are_shared_by_families_then_effects_then_targets(problem):
 def test_members_in_some_recordings_share_what_their_target_has(recordings):
     """Where all explain alike, every effect and target keeps its price however many choices of recordings there are,
     half of it for all of them; an impulse, at one time, is in one recording and each is as likely; a change in time
-    that would begin anew in every recording, whose clocks overlap, has a thirtieth for all of them."""
+    that would begin anew in every recording, whose clocks overlap, has a thirtieth for all of them; outliers are taken
+    out of all recordings alike."""
     problem, members = made(recordings), []
     for m in problem.searched:
         once = problem.candidate(m).effect.name == "impulse" and recordings > 1
         variants = [v for v in problem.variants(m) if not once or len(problem.members[v].recordings) == 1]
-        members += variants if once else [m, *variants]
+        alone = problem.candidate(m).effect.name == "sensor_outliers"
+        members += [m] if alone else variants if once else [m, *variants]
     fits = [one for c in [(), *((m,) for m in members)] for one in alike(problem, c, 1.0)]
     p = posterior(problem, found(problem, *fits), 1.0)
     assert p.as_it_is == pytest.approx(0.5, rel=1e-9) and p.unexplained == pytest.approx(0.5 / FAMILIES, rel=1e-9)
@@ -133,6 +135,7 @@ def test_members_in_some_recordings_share_what_their_target_has(recordings):
         assert total == pytest.approx(0.5 * price(problem, m), rel=1e-9)
         one = problem.candidate(m).effect
         every = 1 / 30 if one.family == "time variation" else 1 / 2
+        every = 1.0 if one.name == "sensor_outliers" else every
         assert recordings == 1 or one.name == "impulse" or whole[m] == pytest.approx(total * every, rel=1e-9)
     subsets = {problem.members[m].recordings for m in members}
     # All, each one alone, and all but one.

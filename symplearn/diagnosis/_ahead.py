@@ -9,7 +9,7 @@ What happens at one time no earlier part can foretell: there a combination count
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .._effects import IMPULSE, REGIME
 from ._calibrate import calibrate, residuals, weights
@@ -56,12 +56,12 @@ def _scores(
         first = [max(1, round(n * share)) for n in rows]
         later = np.array([_is_later(stepper.problem, z, c, first) for z, c in zip(begin, combinations, strict=True)])
         fits = calibrate(stepper, begin, combinations, found.priors, first, _STEPS, held=later)
-        inside, ahead = _squares(stepper, fits.z, combinations, rows, first)
-        value = -0.5 * _READINGS * np.log(ahead).sum(1)
+        (inside, before), (ahead, after) = _squares(stepper, fits.z, combinations, rows, first)
+        value = -0.5 * _READINGS * np.log(ahead[:, after]).sum(1)
         known = [_known(stepper.problem, c, combinations) if late else k
                  for k, (c, late) in enumerate(zip(combinations, later, strict=True))]  # fmt: skip
         total += value[known]
-        holds &= later | (ahead < _HOLDS**2 * inside).all(1)
+        holds &= later | (ahead < _HOLDS**2 * inside)[:, before & after].all(1)
     total = np.where(np.isfinite(total), total, -np.inf)
     if not np.isfinite(total.max()):
         return {}
@@ -93,8 +93,8 @@ def _is_later(problem: Problem, z: np.ndarray, combination: Combination, first: 
 
 def _squares(
     stepper: Stepper, z: np.ndarray, combinations: Sequence[Combination], rows: Sequence[int], first: Sequence[int]
-) -> tuple[Float[np.ndarray, "lane channel"], Float[np.ndarray, "lane channel"]]:
-    """Mean squares of the errors up to each recording's first rows, and after them."""
+) -> list[tuple[Float[np.ndarray, "lane channel"], Bool[np.ndarray, " channel"]]]:
+    """Mean squares of the errors up to each recording's first rows, and after them; and what is read there at all."""
     weight = weights(stepper.problem, rows)
     parts = residuals(stepper.problem, stepper.predict(z, combinations, rows), weight)
     out = []
@@ -102,5 +102,5 @@ def _squares(
         cut = [slice(n, None) if later else slice(None, n) for n in first]
         square = sum((w[s] * x[:, s] ** 2).sum(1) for x, w, s in zip(parts, weight, cut, strict=True))
         number = sum((w[s] > 0).sum(0) for w, s in zip(weight, cut, strict=True))
-        out.append(np.where(number > 0, square / np.maximum(number, 1), 1.0))
-    return out[0], out[1]
+        out.append((square / np.maximum(number, 1), number > 0))
+    return out

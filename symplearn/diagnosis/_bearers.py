@@ -7,9 +7,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import logsumexp
 
-from ._problem import Problem
-from ._weighed import REMAINDER
-
 # As good as none.
 _NONE = 1e-12
 
@@ -39,11 +36,6 @@ def log_likelihood(left: Left, number: int, known: float, variance: float, most:
     if not variance * white <= most**2:
         return -np.inf
     return -0.5 * (number * float(np.log(white)) + left.square / white + left.log)
-
-
-def largest(problem: Problem, channel: int) -> float:
-    """The largest error of a sensor that is not the signal."""
-    return REMAINDER * float(np.nanstd(np.concatenate([r.readings[:, channel] for r in problem.rows])))
 
 
 def sizes(value: Callable[[float], float], tried: Float[np.ndarray, " size"]) -> Sizes:

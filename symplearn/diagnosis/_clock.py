@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import logsumexp
 
-from ._bearers import largest
 from ._bend import Bend, Form, Shapes
 from ._calibrate import Fits, Priors, residuals, weights
 from ._clock_errors import Piece, cleared, fitted, pieces_of
@@ -22,7 +21,7 @@ from ._coloured import Colour
 from ._evidence import variance_inflation
 from ._problem import Problem
 from ._scatter import law_gain
-from ._weighed import Estimate, amplitudes_out, correlated, trusting
+from ._weighed import Estimate, amplitudes_out, correlated, largest, trusting
 
 # How often errors of sensor and clock are fitted, about the path that follows.
 _PASSES = 2

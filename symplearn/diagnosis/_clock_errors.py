@@ -27,7 +27,7 @@ from ._coloured import (
 )
 from ._problem import Problem
 from ._scatter import tail_gain
-from ._weighed import REMAINDER
+from ._weighed import largest
 
 # How often sensor and clock are fitted, in turn, each with the other as it is.
 _TURNS = 3
@@ -107,21 +107,21 @@ def fitted(
     known = problem.noise[j]
     some = [one.middle(column) for one, column in zip(pieces, left, strict=True)]
     grid = grid_of([one.times for one in pieces], not np.isnan(known), _DAMPINGS, _TIMES)
-    largest = REMAINDER * float(np.nanstd(np.concatenate([r.readings[:, j] for r in problem.rows])))
+    most = largest(problem, j)
     both = list(begins[0])
     if len(begins) > 1:  # filled up to the grid's number of points, whose program is compiled already
         shapes = np.resize([[_shape(one) for one in pair] for pair in begins], (len(grid) + 1, 2, 3))
-        both = list(begins[int(np.argmax(_values(some, shapes, known, largest)[: len(begins)]))])
+        both = list(begins[int(np.argmax(_values(some, shapes, known, most)[: len(begins)]))])
     for turn in range(_TURNS):
         searched = 1 - turn % 2
         tried = np.append(grid, [_shape(both[searched])], axis=0)
         shapes = np.repeat([[_shape(one) for one in both]], len(tried), axis=0)
         shapes[:, searched] = tried
-        both[searched] = chosen(tried, _values(some, shapes, known, largest))
+        both[searched] = chosen(tried, _values(some, shapes, known, most))
     best = np.array([_shape(one) for one in both])
     for steps in _NEARBY * np.array(_FINER)[:, None, None, None]:
         shapes = np.append(best[None], best * np.exp(steps), axis=0)
-        best = shapes[int(np.argmax(_values(some, shapes, known, largest)))]
+        best = shapes[int(np.argmax(_values(some, shapes, known, most)))]
     names = ("ratio", "frequency", "damping")
     sensor, clock = (replace(one, **dict(zip(names, map(float, shape), strict=True)))
                      for one, shape in zip(both, best, strict=True))  # fmt: skip

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ._bearers import Left, Sizes, borne, largest, log_likelihood, sizes
+from ._bearers import Left, Sizes, borne, log_likelihood, sizes
 from ._calibrate import Fits, Priors, residuals, weights
 from ._clock_errors import rates
 from ._evidence import variance_inflation
 from ._problem import Problem
 from ._scatter import law_gain
-from ._weighed import Estimate, correlated, trusting
+from ._weighed import Estimate, correlated, largest, trusting
 
 # Variances of the error against the noise's that are tried, where the rate is its root mean square.
 _RATIOS = np.geomspace(0.02, 50.0, 12)

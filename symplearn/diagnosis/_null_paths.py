@@ -78,7 +78,8 @@ def rough_noise(problem: Problem, rows: Sequence[int]) -> Float[np.ndarray, " ch
         joined = np.concatenate([np.diff(column, 3) ** 2 / 20 for column in columns])
         spread = np.nanstd(np.concatenate(columns))
         rough = np.sqrt(np.nanmedian(joined) / 0.455) if np.isfinite(joined).any() else spread
-        count = max(1.0, float(np.median(problem.rows[0].counts[:, j])))
+        counts = np.concatenate([r.counts[:n, j] for r, n in zip(problem.rows, rows, strict=True)])
+        count = float(np.median(counts[counts > 0])) if counts.any() else 1.0
         out.append(known if np.isfinite(known) else max(rough, 1e-6 * spread) * np.sqrt(count))
     return np.array(out)
 

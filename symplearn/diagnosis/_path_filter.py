@@ -61,8 +61,8 @@ def prolonged(
     """A path of the leading rows that runs on freely over the others; where it diverges there, it stays."""
     last = len(path) - 1
     _, later = free_run(stepper.problem, stepper.courses[recording], z, combination, recording, path[last], last)
-    later[~np.isfinite(later).all(1)] = path[last]
-    return np.concatenate([path[:last], later])
+    stays = np.where(np.isfinite(later).all(1, keepdims=True), later, path[last])
+    return np.concatenate([path[:last], stays])
 
 
 def filter_along(

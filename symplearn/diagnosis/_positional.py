@@ -15,13 +15,13 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ._bearers import Left, Sizes, borne, largest, log_likelihood, sizes
+from ._bearers import Left, Sizes, borne, log_likelihood, sizes
 from ._bend import Bend, Form, Shapes
 from ._calibrate import Fits, Priors, residuals, weights
 from ._evidence import variance_inflation
 from ._problem import Problem
 from ._scatter import factor_evidence, law_gain
-from ._weighed import Estimate, amplitudes_out, correlated
+from ._weighed import Estimate, amplitudes_out, correlated, largest
 
 # Forms of an error that goes with what is read alone, and of one that goes with how that changes.
 _FORMS = ((Form.CURVE, Form.BENDS), (Form.CURVE, Form.BENDS, Form.PLAY))

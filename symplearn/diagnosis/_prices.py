@@ -58,7 +58,7 @@ class Prices:
         variants, one = len(self.problem.variants(member)), self.problem.candidate(member)
         if one.effect is IMPULSE:
             return 1.0 / len(self.problem.rows)
-        if variants == 0:
+        if variants == 0 or one.effect.amplitudes == 0:  # a noise is one in all recordings
             return 1.0
         every = _ANEW if one.effect.family == "time variation" and self._clocks_overlap else 0.5
         return every if member == self.problem.whole(member) else (1.0 - every) / variants

@@ -114,6 +114,11 @@ def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -
     return out
 
 
+def largest(problem: Problem, channel: int) -> float:
+    """The largest error of a sensor that is not the signal, as far as it is fitted."""
+    return REMAINDER * float(np.nanstd(np.concatenate([r.readings[: r.fitted, channel] for r in problem.rows])))
+
+
 def weigh_coloured(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -> list[Estimate]:
     """Estimates where each channel's error has a memory: generalised least squares about the trajectory fit.
 
@@ -129,8 +134,8 @@ def weigh_coloured(problem: Problem, fits: Fits, priors: Priors, rows: list[int]
     chosen: list[list[Colour]] = []
     for j in range(problem.channels):
         known = None if np.isnan(problem.noise[j]) else float(problem.noise[j])
-        spread = float(np.nanstd(np.concatenate([rows_.readings[:, j] for rows_ in problem.rows])))
-        colours = fit_colour([x[..., j] for x in r], [w[:, j] for w in weight], times, known, REMAINDER * spread)
+        seen, most = [w[:, j] for w in weight], largest(problem, j)
+        colours = fit_colour([x[..., j] for x in r], seen, times, known, most)
         chosen.append(colours)
         for k in range(len(times)):
             gram, log = _channel_gram(problem, fits, r[k][..., j], weight[k][:, j], times[k], colours, k, j)

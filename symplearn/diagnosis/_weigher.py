@@ -118,16 +118,18 @@ class Weigher:
         return self._owed(members, errors / np.where(less, rest, 1.0), flagged, fit.noise)
 
     def _owed(self, members: Combination, errors: np.ndarray, flagged: np.ndarray, noise: np.ndarray) -> float:
-        """Log evidence of the readings that were taken out, as a density in their own unit."""
+        """Log evidence of the readings that were taken out, as a density in their own unit; one that averages several
+        errs by less."""
         value = outlier_evidence(members, self.plain.problem, errors, flagged)
-        return value - float((flagged.sum(0) * np.log(noise)).sum())
+        weight = np.concatenate(weights(self.plain.problem, self.rows))
+        return value - float((flagged * (np.log(noise) - 0.5 * np.log(np.where(flagged, weight, 1.0)))).sum())
 
     def _path_errors(self, fit: PathFit, r: int) -> np.ndarray:
         """Readings less those on a path, by their noise; NaN where nothing was read."""
-        rows = self.plain.problem.rows[r]
+        read = self.plain.problem.rows[r].readings[: self.rows[r]]
         shown = along(self.problem, readings, r, fit.z, (), fit.paths[r])
-        counts = rows.counts[: len(shown)]
-        return np.where(counts > 0, np.sqrt(counts) * (rows.readings[: len(shown)] - shown) / fit.noise, np.nan)
+        weight = weights(self.plain.problem, self.rows)[r]
+        return np.where(weight > 0, np.sqrt(weight) * (read - shown) / fit.noise, np.nan)
 
     def weigh(self, starts: Sequence[Start], whole: bool = False) -> None:
         """Fit and weigh combinations; on a long recording most are dropped after its first part.
