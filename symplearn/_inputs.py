@@ -1,6 +1,6 @@
 """Inputs between their rows: held, linear or band-limited."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -25,6 +25,7 @@ class Inputs:
     - `interpolation`: `hold` (the value of the latest row), `linear`, or `bandlimited` (evenly sampled; no
         frequencies above half the sampling rate).
     - `name`: of the recording, for sentences.
+    - `missing`: times of rows that lack an input and are left out.
 
     **Raises** `InputError` if times are not even where `bandlimited` needs them so.
     """
@@ -33,6 +34,7 @@ class Inputs:
     values: np.ndarray
     interpolation: str = "hold"
     name: str = "the recording"
+    missing: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         if self.interpolation == "bandlimited":

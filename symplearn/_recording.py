@@ -178,4 +178,4 @@ def _inputs(simulation: SimulationFile, part: _Part, times: np.ndarray, used: sl
             "give inputs in every row used"
         )
     known = ~missing.any(axis=1)
-    return Inputs(times[known], values[known], section.interpolation, part.name)
+    return Inputs(times[known], values[known], section.interpolation, part.name, times[~known])

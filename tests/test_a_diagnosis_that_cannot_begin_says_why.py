@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from symplearn import InputError
+from symplearn._inputs import Inputs
 from symplearn.diagnosis import Options, Restriction, diagnose
+from symplearn.diagnosis._diagnose import _times_ahead
 from symplearn.diagnosis._usable import check_searched
 
 TIMES = np.linspace(0.0, 20.0, 60)
@@ -83,6 +85,38 @@ def test_an_expression_alone_may_be_asked_for():
     check_searched(p, Restriction(("unnamed_force",)))
     with pytest.raises(InputError):
         check_searched(p, Restriction(("contact_stop",)))
+
+
+@pytest.mark.parametrize(
+    ("times", "inputs", "said"),
+    [
+        (1.0, 1e200, "input `u` is 1e+200"),
+        (1e200, 0.0, "the time is"),
+        (1e-170, 0.0, "apart, which is too short"),
+    ],
+)
+def test_inputs_and_times_beyond_numbers_are_refused(times, inputs, said):
+    """Squares of both are taken; what is too large or too short is told, and no decomposition fails after minutes."""
+    driven = cases.simulation("p**2/2 + q**2/2", more='[forces]\np = "u"', recording='inputs = ["u"]')
+    values = np.zeros((len(TIMES), 1))
+    values[7] = inputs
+    assert said in refusal(driven, cases.recorded(TIMES * times, np.cos(TIMES), Inputs(TIMES * times, values)))
+
+
+def test_a_forecast_past_a_missing_input_is_refused():
+    """A row after the last reading that lacks the input is not bridged; one that no forecast reaches may."""
+    driven = cases.simulation("p**2/2 + q**2/2", more='[forces]\np = "u"', recording='inputs = ["u"]')
+    ahead = np.append(TIMES, [21.0, 23.0])
+    inputs = Inputs(ahead, np.zeros((len(ahead), 1)), missing=np.array([22.0]))
+    recording = cases.recorded(TIMES, np.cos(TIMES), inputs)
+    assert "22: an input is missing" in refusal(driven, recording, Options(forecast_until=23.0))
+    assert len(_times_ahead(driven, recording, Options(forecast_until=21.0))) > 0
+
+
+def test_one_row_is_refused_before_its_forecast():
+    """Of one row no spacing is known, and none is made up."""
+    said = refusal(swing(), cases.recorded(TIMES[:1], np.ones(1)), Options(forecast_until=30.0))
+    assert "only one row is used" in said
 
 
 @pytest.mark.parametrize("reading", [1e300, -1e101])

@@ -17,6 +17,7 @@ from ._found import Found
 from ._locate import (
     blows_sentence,
     kind_and_targets,
+    most_strained,
     motion,
     present_windows,
     spell_windows,
@@ -287,7 +288,8 @@ class Answer:
         return {"kind": kind, "targets": targets, "recordings": which, "time_windows": windows, "where": self._where()}
 
     def _where(self) -> str:
-        chosen = [self.problem.candidate(member) for member in self.after.combination]
+        members = self.after.combination
+        chosen = [self.problem.candidate(member) for member in members]
         moving = [one.place for one in chosen if one.effect.acts_on in (COORDINATE, PAIR)]
         if not moving and all(not one.effect.is_dynamics for one in chosen):
             return f"in the sensor of {', '.join(dict.fromkeys(one.targets[0] for one in chosen))}"
@@ -297,8 +299,11 @@ class Answer:
         told = [(one.targets, one.nameless.words) for one in chosen if one.nameless and one.nameless.words]
         if told:
             return f"the missing force on {' and '.join(told[0][0])} {told[0][1]}"
-        first = moving[0] if moving else strained_coordinates(self.lens)[0]
-        return where_sentence(self.problem, self.lens[0], first)
+        dynamics = [m for m, one in zip(members, chosen, strict=True) if one.effect.is_dynamics]
+        there = sorted({r for m in dynamics for r in self.problem.members[m].recordings})
+        lenses = [self.lens[r] for r in there]
+        first = moving[0] if moving else strained_coordinates(lenses)[0]
+        return where_sentence(self.problem, most_strained(lenses, first), first)
 
     def _unexplained_location(self) -> dict[str, Any]:
         eq, numbers = self.problem.equations, list(range(1, len(self.lens) + 1))
@@ -317,7 +322,7 @@ class Answer:
                 found = [(w, r + 1) for r, w in spell_windows(self.problem, self.before.exposures)]
                 numbers = [r for _, r in found]
             else:
-                where = where_sentence(self.problem, self.lens[0], strained[0])
+                where = where_sentence(self.problem, most_strained(self.lens, strained[0]), strained[0])
                 found = strained_when(self.lens, strained)
             windows = [[*w, r] if several else w for w, r in found]
         if self.posterior.is_constant:

@@ -16,6 +16,7 @@ from ._forecast import forecast_times
 from ._options import Options
 from ._record import Diagnosis
 from ._turns import unwrapped
+from ._usable import check_readings
 
 _AS_USUAL = Options()
 
@@ -51,7 +52,8 @@ def _refuse_paths(file: Any, recordings: Any, options: Any) -> None:
 def _diagnosed(file: SimulationFile, recordings: Sequence[Recording], options: Options) -> Diagnosis:
     begin = time.monotonic()
     options.progress("reading the equations of motion")
-    times = _times_ahead(recordings[0], options)
+    check_readings(file, recordings)
+    times = _times_ahead(file, recordings[0], options)
     recordings, notes = unwrapped(file, recordings)
     found, stepper = searched(file, recordings, options, begin + options.time_limit)
     options.progress("comparing before and after on the held-out rows")
@@ -59,11 +61,17 @@ def _diagnosed(file: SimulationFile, recordings: Sequence[Recording], options: O
     return answer.diagnosis(time.monotonic() - begin)
 
 
-def _times_ahead(recording: Recording, options: Options) -> np.ndarray | None:
+def _times_ahead(file: SimulationFile, recording: Recording, options: Options) -> np.ndarray | None:
     """Times to forecast; asked before the long work, so that a wrong wish, or a missing input, is said at once."""
     if options.forecast_until is None:
         return None
     times = forecast_times(recording, options.forecast_until, options.forecast_step)
     if recording.inputs is not None:
         recording.inputs.at(times)
+        for t in recording.inputs.missing[recording.inputs.missing > recording.times[-1]]:
+            if t <= times[-1]:
+                raise InputError(
+                    f"{recording.name}, {file.recording.time} = {t:.10g}: an input is missing that the forecast needs; "
+                    "give inputs in every row up to --forecast-until"
+                )
     return times

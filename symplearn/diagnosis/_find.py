@@ -19,7 +19,7 @@ from ._problem import Problem
 from ._search import Search
 from ._start import first_fits, priors_without_effects
 from ._trajectory import Stepper
-from ._usable import check_columns, check_fitted, check_motion, check_readings, check_searched, check_steps
+from ._usable import check_columns, check_fitted, check_motion, check_searched, check_steps
 
 # Third differences show the noise and some of the motion: the share of them that counts as noise at least.
 _ROUGH = 0.3
@@ -32,7 +32,6 @@ def searched(
 
     `InputError` where there is nothing to fit, to search or to step.
     """
-    check_readings(recordings)
     check_steps(file, recordings)
     first, middle = float(recordings[0].times[0]), float(np.mean(recordings[0].times[[0, -1]]))
     built = augmented_equations(file, first, options.restriction, middle)

@@ -136,6 +136,12 @@ def _window(one: Candidate, values: Mapping[str, float], first: float, last: flo
     return begin, last
 
 
+def most_strained(outlooks: Sequence[Outlook], coordinate: int) -> Outlook:
+    """The recording whose missing force on a coordinate is the clearest."""
+    level = [np.nan_to_num(np.mean(o.strain()[:, coordinate] ** 2)) for o in outlooks]
+    return outlooks[int(np.argmax(level))]
+
+
 def whole_windows(outlooks: Sequence[Outlook]) -> list[list[float | int]]:
     """The whole span of every recording, with its number where there are several."""
     spans = []
@@ -148,7 +154,7 @@ def whole_windows(outlooks: Sequence[Outlook]) -> list[list[float | int]]:
 def where_sentence(problem: Problem, outlook: Outlook, coordinate: int) -> str:
     """What the missing force goes with."""
     name = problem.equations.coordinates[coordinate]
-    if not np.isfinite(outlook.missing_force()).all():
+    if not (np.isfinite(outlook.missing_force()).all() and np.isfinite(outlook.states).all()):
         return f"the simulation of {name} diverges from the recording, so that no missing force can be followed"
     if _is_nothing(outlook, coordinate):
         return f"no missing force on {name} can be followed by itself"

@@ -1,6 +1,6 @@
 """What a diagnosis cannot begin with, each told in one sentence."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -14,8 +14,8 @@ from ._drawn import scattered
 from ._problem import Problem
 from ._start import priors_without_effects
 
-# Squares of readings, and sums of them, stay numbers below this.
-_LARGEST = 1e100
+# Squares of readings, of inputs and of times, and sums of them, stay numbers below this; those of spans above that.
+_LARGEST, _SHORTEST = 1e100, 1e-100
 # Substeps that can be laid out in all, some hundred megabytes of times.
 _STEPS = 2e7
 # Readings beyond the unknown numbers with which a column tells its noise: an effect has up to so many numbers more.
@@ -29,8 +29,8 @@ _SAID = {
 }
 
 
-def check_readings(recordings: Sequence[Recording]) -> None:
-    """Every recording has two rows, and no reading is so large that its square is no number. `InputError` otherwise."""
+def check_readings(file: SimulationFile, recordings: Sequence[Recording]) -> None:
+    """Every recording has two rows, and no number is so large that its square is none. `InputError` otherwise."""
     for r in recordings:
         if len(r.times) < 2:
             raise InputError(
@@ -43,6 +43,25 @@ def check_readings(recordings: Sequence[Recording]) -> None:
                 f"large to compute with; leave the cell empty, or give the column in a unit in which it is below "
                 f"{_LARGEST:g}"
             )
+        for t, name, value in _too_large(file, r):
+            raise InputError(
+                f"{r.name}, t = {t:g}: {name} is {value:g}, which is too large to compute with; give it in a unit in "
+                f"which it is below {_LARGEST:g}"
+            )
+        if np.diff(r.times).min() < _SHORTEST:
+            raise InputError(
+                f"{r.name}: rows lie {np.diff(r.times).min():g} apart, which is too short to compute with; give times "
+                f"in a unit in which it is above {_SHORTEST:g}"
+            )
+
+
+def _too_large(file: SimulationFile, r: Recording) -> Iterator[tuple[float, str, float]]:
+    """Times, and inputs, beyond what can be squared, and when."""
+    yield from ((float(t), "the time", float(t)) for t in r.times[np.abs(r.times) > _LARGEST])
+    if r.inputs is not None:
+        for row, column in np.argwhere(np.abs(r.inputs.values) > _LARGEST):
+            name = f"input {shown(file.recording.inputs[column])}"
+            yield float(r.inputs.times[row]), name, float(r.inputs.values[row, column])
 
 
 def check_steps(file: SimulationFile, recordings: Sequence[Recording]) -> None:
