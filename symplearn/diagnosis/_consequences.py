@@ -135,12 +135,12 @@ def _swings(said: Said) -> str:
 
 
 def _creeps(said: Said) -> str:
-    way = said.by_sign("r", "grows", "falls")
+    way = said.by_sign("r", "grows", "shrinks")  # which a negative value does by a change of either sign, too
     return f"It {way} by {said.percent('r')} {said.per_time('r')} of its value at the first row."
 
 
 def _switches(said: Said) -> str:
-    way = said.by_sign("d", "higher", "lower")
+    way = said.by_sign("d", "larger", "smaller")
     return f"From t = {said.value('t_star')} on it is {said.percent('d')} {way} than before."
 
 
@@ -152,7 +152,7 @@ def _exchanges(said: Said) -> str:
 
 
 def _corrects(said: Said) -> str:
-    way = said.by_sign("d", "higher", "lower")
+    way = said.by_sign("d", "larger", "smaller")
     return f"It should be {said.percent('d')} {way} than given; the form of the equations stays as it is."
 
 
@@ -182,6 +182,8 @@ def _wanders(said: Said) -> str:
 
 def _lags(said: Said) -> str:
     unit = said.units.get("tau") or "units of time"
+    if said.mean("tau") < 0:  # beside a known delay
+        return f"It is so by {number(-said.mean('tau'))} {unit}; {_ALONE}"
     return f"It shows what was {number(said.mean('tau'))} {unit} before; {_ALONE}"
 
 

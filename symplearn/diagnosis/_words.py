@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .._effects import Candidate
+from .._effects import DELAY, Candidate
 from .._vocabulary import PAIR, VOCABULARY
 from ._consequences import Said, consequence
 from ._law_text import equation_lines as equation_lines
@@ -48,6 +48,8 @@ _TOO_STRONG = {
     "coulomb_friction": "The dry friction on {q} that the simulation has is too strong",
     "relative_damping": "The damping between {q} and {q2} that the simulation has is too strong",
 }
+# As of a delay that is known.
+_TOO_LATE = "The sensor of {q} is less late than the simulation has it"
 # Plain words for an effect that a finding is hard to tell from.
 _NOUNS = {
     "viscous_damping": "a viscous damping",
@@ -111,7 +113,10 @@ def finding_sentence(
     """
     said = Said(one, coefficients, units)
     openings = _TOO_STRONG if said.takes_back else _OPENINGS
-    opening = openings[one.effect.name].format(q=one.targets[0], q2=one.targets[-1], side=_side(one))
+    too_late = one.effect is DELAY and said.mean("tau") < 0
+    opening = (_TOO_LATE if too_late else openings[one.effect.name]).format(
+        q=one.targets[0], q2=one.targets[-1], side=_side(one)
+    )
     if one.nameless is not None and one.nameless.words:
         opening += f"; it {one.nameless.words}"
     words = [f"{opening}: {_law_with_numbers(said)}."]
