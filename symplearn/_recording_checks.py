@@ -31,7 +31,7 @@ def check_times(times: np.ndarray, lines: np.ndarray, column: str, name: str) ->
         what = "repeats" if times[row] == times[row - 1] else "goes back"
         raise InputError(
             f"{name}, line {lines[row]}, column {shown(column)}: the time {what} "
-            f"({times[row]:.10g} after {times[row - 1]:.10g}); "
+            f"({float(times[row])!r} after {float(times[row - 1])!r}); "
             "times must increase within a recording (`group` tells recordings in one file apart)"
         )
 

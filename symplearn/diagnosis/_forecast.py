@@ -44,7 +44,7 @@ def forecast_times(recording: Recording, until: float, step: float | None) -> Fl
         raise InputError(f"--forecast-step: is {step}; give a positive number in the recording's unit of time")
     if not math.isfinite(until) or until < last + step * (1 - 1e-9):
         raise InputError(
-            f"--forecast-until: is {until:.6g}, and the last observed time is {last:.6g}; give a time at least "
+            f"--forecast-until: is {until:.10g}, and the last observed time is {last:.10g}; give a time at least "
             f"{step:.6g} later"
         )
     count = math.floor((until - last) / step + 1e-9)

@@ -2,9 +2,10 @@
 
 from typing import Any
 
+from ..diagnosis._law_text import moment
 from ..diagnosis._record import Diagnosis
 from ._units import time_unit
-from ._words import combination, number, plain, probability, takes_back
+from ._words import combination, plain, probability, takes_back
 
 PROBLEM = "The fit did not converge: the numbers here are where it stopped, not an answer to rely on."
 
@@ -43,5 +44,5 @@ def _target(target: str | list[str]) -> str:
 
 def _window(window: list[Any], diagnosis: Diagnosis) -> str:
     unit = time_unit(diagnosis)
-    span = f"{number(window[0])} to {number(window[1])}" + (f" {plain(unit)}" if unit else "")
+    span = f"{moment(window[0])} to {moment(window[1])}" + (f" {plain(unit)}" if unit else "")
     return f"{span} in recording {int(window[2])}" if len(window) > 2 else span
