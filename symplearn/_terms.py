@@ -73,8 +73,11 @@ def mechanics(file: SimulationFile, start: float) -> Mechanics:
     )
     for number, term in enumerate(file.terms, start=1):
         _check(file, term, number)
-        if term.effect in _WRITTEN:
-            _WRITTEN[term.effect](built, term, _numbers(built, term, number))
+    # What scales a parameter does so wherever it stands, in forces of terms that come later, too.
+    for written in (_ADDED, _SCALED):
+        for number, term in enumerate(file.terms, start=1):
+            if term.effect in written:
+                written[term.effect](built, term, _numbers(built, term, number))
     return built
 
 
@@ -185,13 +188,15 @@ def _scaled(change: Callable[[Mechanics, _Numbers], sympy.Expr]) -> Callable[[Me
     return write
 
 
-_WRITTEN: dict[str, Callable[[Mechanics, Term, _Numbers], None]] = {
+_ADDED: dict[str, Callable[[Mechanics, Term, _Numbers], None]] = {
     "self_excitation": _self_excitation,
     "contact_stop": _contact_stop,
     "periodic_forcing": _periodic_forcing,
     "impulse": _impulse,
     "hidden_oscillator": _hidden_oscillator,
     "unnamed_force": _unnamed_force,
+}
+_SCALED: dict[str, Callable[[Mechanics, Term, _Numbers], None]] = {
     "parametric_modulation": _scaled(lambda built, c: c["a"] * sympy.cos(c["omega"] * _TIME + c["phi"])),
     "regime_change": _scaled(lambda built, c: c["d"] * Step(_TIME - c["t_star"])),
 }

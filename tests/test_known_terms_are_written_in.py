@@ -174,6 +174,16 @@ def test_a_term_is_in_every_recording_unless_it_says_so(effect):
         np.testing.assert_allclose(found, ALL[term](), atol=2e-4)
 
 
+@pytest.mark.parametrize("last", [False, True], ids=["before", "after"])
+def test_a_parameter_that_changes_does_so_in_every_force(last):
+    """A regime change of k scales an unnamed force that uses k, whether it stands before the force or after it."""
+    change = 'effect = "regime_change"\ntarget = "k"\nd = 0.5\nt_star = 5.0\n'
+    force = 'effect = "unnamed_force"\ntarget = "x"\nexpression = "-0.4*k*x**3"\n'
+    expected = by_hand(lambda t, x, y, p, r: (-K * 0.5 * (t > 5) * x - 0.4 * K * (1 + 0.5 * (t > 5)) * x**3, 0))
+    found = simulated("[[terms]]\n".join([force, change] if last else [change, force]))[0]
+    np.testing.assert_allclose(found, expected, atol=2e-4)  # order 2 at the kink in time
+
+
 CALIBRATED = """effect = "coupling_spring"
 target = ["x", "y"]
 k = { value = 0.2, sd = 0.3 }
