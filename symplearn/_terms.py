@@ -7,6 +7,7 @@ term that is not in every recording, are further parameters.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from math import prod
 
 import sympy
 
@@ -98,13 +99,9 @@ def _numbers(built: Mechanics, term: Term, number: int) -> "_Numbers":
 
 
 def noise_factor(file: SimulationFile, column: str) -> float:
-    """By how much `sensor_noise` terms widen the noise of a column; NaN where one of them is calibrated."""
-    factor = 1.0
-    for term in file.terms:
-        if term.effect == "sensor_noise" and term.target == (column,):
-            s = term.coefficients["s"]
-            factor *= s.value if s.known else float("nan")
-    return factor
+    """By how much `sensor_noise` terms widen the noise of a column."""
+    own = [t for t in file.terms if t.effect == "sensor_noise" and t.target == (column,)]
+    return prod((t.coefficients["s"].value for t in own), start=1.0)
 
 
 def _check(file: SimulationFile, term: Term, number: int) -> None:
