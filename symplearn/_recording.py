@@ -1,6 +1,6 @@
 """Recordings: what was measured, when, and with which inputs (contract, section 2)."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,7 +54,7 @@ def read_recordings(simulation: SimulationFile, paths: str | Path | Sequence[str
     plain = [Path(path).name for path in paths]
     names = [str(path) if plain.count(name) > 1 else name for path, name in zip(paths, plain, strict=True)]
     parts = [part for path, name in zip(paths, names, strict=True) for part in _parts(simulation, path, name)]
-    _check_bounds(simulation, parts)
+    _check_bounds(simulation, paths, parts)
     recordings = [_recording(simulation, part, number) for number, part in enumerate(parts, start=1)]
     check_recordings(simulation, recordings)
     return recordings
@@ -115,18 +115,32 @@ def _bound(bound: float | Mapping[str, float] | None, group: tuple[str, ...], de
     return (exact + alike + [default])[0]
 
 
-def _check_bounds(simulation: SimulationFile, parts: Sequence[_Part]) -> None:
-    """Every group value of a `start` or `end` table is met in some file."""
+def _check_bounds(simulation: SimulationFile, paths: Sequence[str | Path], parts: Sequence[_Part]) -> None:
+    """Every group value of a `start` or `end` table is met in some file, if only in rows that `where` leaves out."""
+    bounds = [(key, getattr(simulation.recording, key)) for key in ("start", "end")]
+    given = [(key, value) for key, bound in bounds if isinstance(bound, Mapping) for value in bound]
     met = [part.group for part in parts]
-    for key in ("start", "end"):
-        bound = getattr(simulation.recording, key)
-        for value in bound if isinstance(bound, Mapping) else ():
-            if all(np.isnan(_bound({value: 0.0}, group, np.nan)) for group in met):
-                known = dict.fromkeys(", ".join(group) for group in met)
-                raise InputError(
-                    f"{simulation.name}, [recording] {key}: no group has the value {shown(value)}; "
-                    f"{nearest(value, known)}"
-                )
+    unmet = [one for one in given if not _is_met(one[1], met)]
+    beside = _left_out(simulation, paths) if unmet else set()
+    for key, value in unmet:
+        if not _is_met(value, beside):
+            known = dict.fromkeys(", ".join(group) for group in met)
+            raise InputError(
+                f"{simulation.name}, [recording] {key}: no group has the value {shown(value)}; {nearest(value, known)}"
+            )
+
+
+def _is_met(value: str, groups: Iterable[tuple[str, ...]]) -> bool:
+    return not all(np.isnan(_bound({value: 0.0}, group, np.nan)) for group in groups)
+
+
+def _left_out(simulation: SimulationFile, paths: Sequence[str | Path]) -> set[tuple[str, ...]]:
+    """Group values of all rows, where `where` leaves some out; the files are read once more for them."""
+    section = simulation.recording
+    if not section.where:
+        return set()
+    every = [read_columns(path, numbers=(), texts=section.group).texts for path in paths]
+    return {cells for texts in every for cells in zip(*(texts[name] for name in section.group), strict=True)}
 
 
 def _recording(simulation: SimulationFile, part: _Part, number: int) -> Recording:

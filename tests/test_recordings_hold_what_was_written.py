@@ -149,6 +149,14 @@ def test_start_and_end_are_both_inside(tmp_path):
     np.testing.assert_array_equal(found[1].times, [1, 2])
 
 
+def test_a_start_of_a_group_that_is_left_out_does_no_harm(tmp_path):
+    """A start may be given for every group of the file, also for one of which `where` takes no row."""
+    starts = 'where = { run = 1 }\ngroup = "run"\nstart = { "1" = 1, "2" = 0.5 }'
+    (recording,) = read(tmp_path, GROUPED, starts)
+    assert recording.name == "r.csv (run 1)"
+    np.testing.assert_array_equal(recording.times, [1, 2])
+
+
 def test_rows_after_the_last_reading_only_carry_inputs(tmp_path):
     """Future inputs are rows with empty observed cells: known to `inputs`, not among the used rows."""
     text = "t,u,a\n0,1,1\n1,2,\n2,3,4\n3,5,2\n4,7,\n5,9,\n6,,\n"
@@ -175,6 +183,7 @@ def test_inputs_reach_outside_the_window(tmp_path):
         (GROUPED, 'group = "rnu"', "no column `rnu`; did you mean `run`"),
         (GROUPED, 'where = { ball = "z" }', "none has `ball = z`"),
         (GROUPED, BALL + 'start = { "3" = 1 }', "no group has the value `3`"),
+        (GROUPED, 'where = { run = 1 }\ngroup = "run"\nend = { "3" = 1 }', "no group has the value `3`; known are `1`"),
         (GROUPED, BALL + "start = 7", "no row lies between start = 7"),
         (PLAIN, "start = 2\nend = 3", "all readings of the rows used are missing"),
         (GROUPED.replace("1,x,1", ",x,1"), BALL, "line 6, column `run`: no group"),
