@@ -4,7 +4,10 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import sympy
+
 from ._expression import Expression
+from ._kinks import Sign, Step
 from ._simulation_records import Quantity, SimulationFile, Term
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
@@ -14,6 +17,13 @@ _ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\r": "\\r", "\t": "\\t"}
 def simulation_text(simulation: SimulationFile) -> str:
     """The TOML text of a simulation. Expressions are the user's own words; numbers are exact (repr)."""
     return "\n".join(_lines(simulation)) + "\n"
+
+
+def worded(tree: sympy.Expr) -> Expression:
+    """A tree in words that are read back: a step, which slopes of `min` and `max` leave, is half of one and a sign."""
+    if tree.has(Step):
+        tree = tree.replace(Step, lambda arg: (1 + Sign(arg)) / 2)
+    return Expression(str(tree), tree)
 
 
 def _lines(simulation: SimulationFile) -> Iterator[str]:

@@ -7,9 +7,14 @@ import pickle
 import numpy as np
 import pytest
 
+from symplearn._effects import RELAXING
 from symplearn._errors import InputError
+from symplearn._expression import symbol
 from symplearn._simulation_file import Quantity, Term, parse_simulation
 from symplearn._simulation_text import simulation_text
+from symplearn._symbolic import derivative
+from symplearn.diagnosis._memories import written_memory
+from symplearn.diagnosis._unnamed import written
 
 FULL = r'''
 title = "A \"quoted\" title\nof two lines, ünïcode \u0007 and \\"
@@ -137,3 +142,20 @@ def test_gyroscopic_order_has_a_meaning():
     """A pair written against the order of the coordinates is refused where that changes a sign."""
     with pytest.raises(InputError, match="swap the two names and the sign of b"):
         parse_simulation(FULL.replace('target = ["x", "y"]', 'target = ["y", "x"]'), "a.toml")
+
+
+def test_a_force_along_a_kink_is_read_back():
+    """Where the energy has a kink, here H = p^3/2 above zero and 0 below, a force that was found and goes with the
+    velocity is written in words that are read back, as is what one that fades remembers: as numbers they are those of
+    v = 3 p^2/2 and 0, worked out by hand."""
+    file = parse_simulation(SHORT.replace("p**2/2 + q**2/2", "p**2/2*max(p, 0) + q**2/2"), "short.toml")
+    force = written([derivative(file.hamiltonian.tree, file.symbols["p"])], [-0.4])
+    faded, rates = written_memory(file, RELAXING, "q", [0.8, 2.0])
+    terms = (Term("unnamed_force", ("q",), {}, expression=force),
+             Term("unnamed_force", ("q",), {}, expression=faded, memory=rates))  # fmt: skip
+    again = parse_simulation(simulation_text(dataclasses.replace(file, terms=terms)), "augmented.toml").terms
+    for p, v in ((-1.0, 0.0), (0.5, 0.375), (2.0, 6.0)):
+        at = {"p": p, "w": 0.3}
+        found = [one.tree.subs({symbol(name): value for name, value in at.items()})
+                 for one in (again[0].expression, again[1].memory["w"])]  # fmt: skip
+        np.testing.assert_allclose(np.array(found, float), [-0.4 * v, 0.8 * v - 0.15], rtol=1e-14)  # rounding

@@ -11,6 +11,7 @@ from .._effects import MEMORIES, RELAXING, SLIPPING, YIELDING, Memory, Nameless
 from .._expression import Expression, symbol
 from .._kinks import Absolute
 from .._simulation_records import SimulationFile
+from .._simulation_text import worded
 from .._symbolic import derivative
 from ._motion import rms
 
@@ -67,4 +68,4 @@ def written_memory(
     w, v = symbol(name), derivative(file.hamiltonian.tree, file.symbols[momentum])
     kappa, lasting = (sympy.Float(float(f"{value:.6g}"), 8) for value in values)
     tree = kappa * v - memory.lost(v, Absolute(v), w, Absolute(w)) / lasting
-    return Expression(str(-w), -w), {name: Expression(str(tree), tree)}
+    return worded(-w), {name: worded(tree)}

@@ -13,6 +13,7 @@ from .._effects import Nameless
 from .._expression import Expression
 from .._kinks import Absolute, Sign
 from .._simulation_records import SimulationFile
+from .._simulation_text import worded
 from .._symbolic import derivative, numpy_function
 from ._outlook import Outlook
 
@@ -52,8 +53,9 @@ def proposals(file: SimulationFile, outlooks: Sequence[Outlook], coordinates: Se
 
 def written(terms: Sequence[sympy.Expr], sizes: Iterable[float]) -> Expression:
     """The force as an expression of the simulation's names."""
-    tree = sympy.Add(*(sympy.Float(float(f"{size:.6g}"), 8) * term for term, size in zip(terms, sizes, strict=True)))
-    return Expression(str(tree), tree)
+    return worded(
+        sympy.Add(*(sympy.Float(float(f"{size:.6g}"), 8) * term for term, size in zip(terms, sizes, strict=True)))
+    )
 
 
 def library(file: SimulationFile) -> list[sympy.Expr]:
