@@ -5,7 +5,8 @@ part of the Hamiltonian, the forces or the parameters (contract, section 3). A c
 term that is not in every recording, are further parameters.
 """
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
 
@@ -74,23 +75,36 @@ def mechanics(file: SimulationFile, start: float) -> Mechanics:
     )
     for number, term in enumerate(file.terms, start=1):
         _check(file, term, number)
+    names = calibrated_names(file.terms)
     # What scales a parameter does so wherever it stands, in forces of terms that come later, too.
     for written in (_ADDED, _SCALED):
         for number, term in enumerate(file.terms, start=1):
             if term.effect in written:
-                written[term.effect](built, term, _numbers(built, term, number))
+                written[term.effect](built, term, _numbers(built, term, number, names))
     return built
 
 
-def _numbers(built: Mechanics, term: Term, number: int) -> "_Numbers":
+def calibrated_names(terms: Sequence[Term]) -> dict[tuple[int, str], str]:
+    """What every calibrated coefficient is called, by the number of its term, from 1, and its own name; the number
+    is said where two would be called the same."""
+    spoken = {
+        (number, name): f"{term.effect}({', '.join(term.target)}).{name}"
+        for number, term in enumerate(terms, start=1)
+        for name, quantity in term.coefficients.items()
+        if not quantity.known
+    }
+    shared = Counter(spoken.values())
+    return {key: f"{one} of [[terms]] {key[0]}" if shared[one] > 1 else one for key, one in spoken.items()}
+
+
+def _numbers(built: Mechanics, term: Term, number: int, names: Mapping[tuple[int, str], str]) -> "_Numbers":
     """A term's coefficients: numbers where they are known, else parameters; the first is masked by recording."""
     out: _Numbers = {}
     for name, quantity in term.coefficients.items():
         out[name] = sympy.Float(quantity.value)
         if not quantity.known:
             out[name] = sympy.Symbol(f"term{number}.{name}", real=True)
-            spoken = f"{term.effect}({', '.join(term.target)}).{name}"
-            built.further.append(Further(out[name], quantity, None, spoken))
+            built.further.append(Further(out[name], quantity, None, names[number, name]))
     if term.recordings is not None:
         mask = sympy.Symbol(f"term{number}.on", real=True)
         built.further.append(Further(mask, Quantity(1.0), term.recordings, ""))

@@ -16,7 +16,7 @@ from .._recording import Recording
 from .._rows import HasRows, Rows, bin_width, lay_out
 from .._simulation_records import Quantity, SimulationFile
 from .._symbolic import TooLarge
-from .._terms import mechanics, noise_factor
+from .._terms import calibrated_names, mechanics, noise_factor
 from .._thinning import highest_frequency
 from .._vocabulary import PARAMETER
 from ._calibrate import weights
@@ -203,8 +203,8 @@ def _values(file: SimulationFile, built: Equations, recordings: int) -> tuple[np
     free = [(n, i, q, everywhere) for i, (n, q) in enumerate(listed) if not q.known]
     number = len(free)
     known = np.zeros((recordings, built.size))
-    firsts = {c.key: c.first for c in built.candidates}
-    for term in file.terms:
+    firsts, names = {c.key: c.first for c in built.candidates}, calibrated_names(file.terms)
+    for count, term in enumerate(file.terms, start=1):
         if not (term.effect in EFFECTS and EFFECTS[term.effect].is_additive):
             continue  # written into the equations
         ((name, quantity),) = term.coefficients.items()
@@ -212,7 +212,7 @@ def _values(file: SimulationFile, built: Equations, recordings: int) -> tuple[np
         if quantity.known:
             known[:, place] += mask * quantity.value
         else:
-            free.append((f"{term.effect}({', '.join(term.target)}).{name}", place, quantity, mask))
+            free.append((names[count, name], place, quantity, mask))
     return parameters, known, _calibrated(free, number, recordings)
 
 
