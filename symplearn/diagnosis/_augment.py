@@ -1,17 +1,29 @@
 """The simulation with the findings put back, as a simulation file again."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
-from .._effects import EFFECTS, Candidate
+from .._effects import EFFECTS, NOISE, Candidate
 from .._expression import Expression
 from .._simulation_records import Quantity, SimulationFile, Term
+from .._terms import calibrated_names
+from .._vocabulary import VOCABULARY
 from ._calibrate import Priors
 from ._found import within_bounds
 from ._problem import Problem
 from ._weighed import Estimate
+
+
+@dataclass(frozen=True)
+class Put:
+    """A term as it is put back, and where in z its one coefficient stands where that is calibrated, or was found."""
+
+    term: Term
+    places: tuple[int, ...] = ()
 
 
 def augmented(
@@ -29,14 +41,16 @@ def augmented(
     `expressions` of forces without a name, on each coordinate, and the `memories` of those that have one.
     """
     parameters, c = dict(file.parameters), problem.calibrated
-    z = within_bounds(problem, priors, estimate).z[problem.head : problem.slots]
-    sd = np.sqrt(np.diag(estimate.covariance)[problem.head : problem.slots])
-    for j in range(c.parameters):
-        if c.names[j] in parameters:
-            parameters[c.names[j]] = _recalibrated(parameters[c.names[j]], float(z[j]), float(sd[j]))
-    terms = _recalibrated_terms(file, dict(zip(c.names, zip(z, sd, strict=True), strict=True)))
+    z = within_bounds(problem, priors, estimate).z
+    sd, where = np.sqrt(np.diag(estimate.covariance)), {name: problem.head + j for j, name in enumerate(c.names)}
+    for name, k in where.items():
+        if name in parameters:
+            parameters[name] = _recalibrated(parameters[name], float(z[k]), float(sd[k]))
+    known, found = _recalibrated_terms(file, where, z, sd), dict(problem.placed(estimate.combination))
     for member, values in coefficients.items():
-        terms = _merged(terms, _term(problem, member, values))
+        one = Put(_term(problem, member, values), (found[member].start,))
+        known = merged(known, one, len(problem.rows), estimate.covariance)
+    terms = [one.term for one in known]
     for member, some in expressions.items():
         bare = _term(problem, member, {})
         bare = replace(bare, memory=memories.get(member, {}))
@@ -45,13 +59,13 @@ def augmented(
 
 
 def _term(problem: Problem, member: int, values: Mapping[str, float]) -> Term:
-    one, which = problem.candidate(member), problem.members[member].recordings
+    one = problem.candidate(member)
     return Term(
         effect=one.effect.name,
         target=one.targets,
         coefficients={name: Quantity(float(value)) for name, value in values.items()},
         side=one.side,
-        recordings=None if len(which) == len(problem.rows) else tuple(r + 1 for r in which),
+        recordings=_told({r + 1 for r in problem.members[member].recordings}, len(problem.rows)),
     )
 
 
@@ -59,26 +73,85 @@ def _recalibrated(quantity: Quantity, value: float, sd: float) -> Quantity:
     return replace(quantity, value=value, sd=sd if np.isfinite(sd) and sd > 0 else quantity.sd)
 
 
-def _recalibrated_terms(file: SimulationFile, found: Mapping[str, tuple[float, float]]) -> list[Term]:
-    """Known terms as they are; calibrated coefficients, found by their names, at their posterior."""
-    terms = []
-    for term in file.terms:
-        spoken = f"{term.effect}({', '.join(term.target)})"
-        values = {
-            name: _recalibrated(q, *map(float, found[f"{spoken}.{name}"])) if f"{spoken}.{name}" in found else q
-            for name, q in term.coefficients.items()
-        }
-        terms.append(replace(term, coefficients=values))
-    return terms
+def _recalibrated_terms(
+    file: SimulationFile, where: Mapping[str, int], z: Float[np.ndarray, " z"], sd: Float[np.ndarray, " z"]
+) -> list[Put]:
+    """Known terms as they are; calibrated coefficients, of which `where` tells the places in z, at their posterior."""
+    out, names = [], calibrated_names(file.terms)
+    for number, term in enumerate(file.terms, start=1):
+        called = {name: names.get((number, name), "") for name in term.coefficients}
+        places = {name: where[one] for name, one in called.items() if one in where}
+        values = {name: _recalibrated(term.coefficients[name], float(z[k]), float(sd[k])) for name, k in places.items()}
+        out.append(Put(replace(term, coefficients=dict(term.coefficients) | values), tuple(places.values())))
+    return out
 
 
-def _merged(terms: list[Term], new: Term) -> list[Term]:
-    """Add to the term of the same effect, target and recordings where effects of this kind add, or append it."""
-    for k, term in enumerate(terms):
-        same = (term.effect, term.target, term.recordings) == (new.effect, new.target, new.recordings)
-        if same and (EFFECTS[new.effect].is_additive or new.effect == "sensor_noise"):
-            (name,) = new.coefficients
-            old, more = term.coefficients[name], new.coefficients[name].value
-            value = old.value * more if new.effect == "sensor_noise" else old.value + more
-            return [*terms[:k], replace(term, coefficients={name: replace(old, value=value)}), *terms[k + 1 :]]
-    return [*terms, new]
+def merged(known: Sequence[Put], new: Put, number: int, covariance: Float[np.ndarray, "z z"]) -> list[Put]:
+    """Terms with a finding among `number` recordings: where its kind adds, one term of the sum with all that act there
+    already, and what stands for other recordings stays for these."""
+    if not (EFFECTS[new.term.effect].is_additive or new.term.effect == NOISE.name):
+        return [*known, new]
+    here, law, out = _recordings(new.term, number), (new.term.effect, new.term.target), list[Put]()
+    own = {k: _recordings(one.term, number) for k, one in enumerate(known) if (one.term.effect, one.term.target) == law}
+    own = {k: some for k, some in own.items() if some & here}
+    sums = [
+        _sum([known[k] for k in acting], new, _told(which, number), covariance)
+        for acting, which in _together(own, here).items()
+    ]
+    for k, one in enumerate(known):
+        if k not in own:
+            out.append(one)
+        elif rest := own[k] - here:
+            out.append(replace(one, term=replace(one.term, recordings=_told(rest, number))))
+        out += sums if k == min(own, default=None) else []
+    return out if own else [*out, *sums]
+
+
+def _together(own: Mapping[int, set[int]], here: set[int]) -> dict[tuple[int, ...], set[int]]:
+    """Which of some terms act together, and in which of some recordings they do."""
+    out: dict[tuple[int, ...], set[int]] = {}
+    for r in sorted(here):
+        out.setdefault(tuple(k for k in own if r in own[k]), set()).add(r)
+    return out
+
+
+def _recordings(term: Term, number: int) -> set[int]:
+    return set(term.recordings or range(1, number + 1))
+
+
+def _told(recordings: set[int], number: int) -> tuple[int, ...] | None:
+    """As a term has them: None where it is in all."""
+    return None if len(recordings) == number else tuple(sorted(recordings))
+
+
+def _sum(known: Sequence[Put], new: Put, recordings: tuple[int, ...] | None, covariance: np.ndarray) -> Put:
+    """One term for what acts in the same recordings: its coefficient, and how well it is known, are the sum's."""
+    ((name, found),) = new.term.coefficients.items()
+    parts, places = [one.term.coefficients[name] for one in known], [k for one in (*known, new) for k in one.places]
+    every = [q.value for q in (*parts, found)]
+    # Factors of a noise are numbers, and none of them is calibrated.
+    value = math.prod(every) if new.term.effect == NOISE.name else math.fsum(every)
+    sd = math.sqrt(max(0.0, covariance[np.ix_(places, places)].sum()))
+    quantity = _allowed(parts, value, sd, name in VOCABULARY[new.term.effect].positive)
+    return Put(replace(new.term, coefficients={name: quantity}, recordings=recordings), tuple(places))
+
+
+def _allowed(parts: Sequence[Quantity], value: float, sd: float, is_positive: bool) -> Quantity:
+    """A sum as it is read back: known where all of its parts are, otherwise calibrated within those limits that it
+    keeps to; others were its part's and not its own."""
+    if is_positive and value <= 0:
+        return Quantity(0.0)  # a loss that is wholly taken back, to rounding: the term stays, and does nothing
+    free = [q for q in parts if not q.known]
+    if not free:
+        return Quantity(value)
+    old = free[0] if len(parts) == 1 else Quantity(value, known=False, sd=free[0].sd)
+    return _recalibrated(
+        replace(
+            old,
+            positive=old.positive and value > 0,
+            lower=old.lower if old.lower is not None and old.lower <= value else None,
+            upper=old.upper if old.upper is not None and value <= old.upper else None,
+        ),
+        value,
+        sd,
+    )
