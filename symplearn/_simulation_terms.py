@@ -111,7 +111,7 @@ class TermReader:
         if word.name == "sensor_noise" and not result.known:
             # A noise is known or estimated; nothing between the two is fitted.
             raise InputError(
-                f"{where}: a table was given, but how much larger a noise is is not calibrated; give a number, "
+                f"{where}: a table was given, but the factor of a noise is not calibrated; give a number, "
                 "or leave this term and the column's noise in [recording.noise] out to have the noise estimated"
             )
         # What is calibrated stays so: a friction that is not there must not come back as one that drives.

@@ -5,7 +5,7 @@ import pytest
 from engine_cases import solved
 
 from symplearn import Recording, parse_simulation
-from symplearn._effects import EFFECTS
+from symplearn._effects import EFFECTS, QUADRATIC, VISCOUS
 from symplearn._errors import InputError
 from symplearn.diagnosis import Restriction
 from symplearn.diagnosis._build import augmented_equations, build
@@ -284,3 +284,18 @@ def test_a_term_that_stands_twice_is_told():
     assert len(told(damping, damping, damping)) == 1
     assert told(damping, damping.replace('"y"', '"x"'), forcing, forcing.replace("2.0", "3.0")) == []
     assert told(damping + "recordings = [1]\n", damping + "recordings = [2]\n") == []
+
+
+def test_as_much_is_taken_back_as_is_known_where_it_is():
+    """A damping may be found below nothing by what is known of it in the recordings of the finding: by 0.3 in the
+    first, by 0.1 in the second, and by the less of the two in both; of a stiffness, any amount."""
+    terms = [
+        f'effect = "viscous_damping"\ntarget = "y"\nc = {c}\nrecordings = [{r}]\n' for r, c in ((1, 0.3), (2, 0.1))
+    ]
+    problem = made("[[terms]]\n".join(terms), [np.zeros((len(TIMES), 2))] * 2)
+    of_y = {
+        (m.candidate.effect, m.recordings): k for k, m in enumerate(problem.members) if m.candidate.targets == ("y",)
+    }
+    lowest = {key: problem.lowest(k) for key, k in of_y.items()}
+    assert [lowest[VISCOUS, r].item() for r in ((0,), (1,), (0, 1))] == [-0.3, -0.1, -0.1]
+    assert lowest[EFFECTS["linear_stiffness"], (0,)] == -np.inf and lowest[QUADRATIC, (0,)] == 0.0

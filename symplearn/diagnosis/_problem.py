@@ -242,8 +242,8 @@ class Problem:
         }
 
     def lowest(self, member: int) -> Float[np.ndarray, " amplitude"]:
-        """Below which value each amplitude of an effect is not physical."""
-        one = self.candidate(member)
+        """Below which value each amplitude of an effect is not physical, by what is known in its own recordings."""
+        one, where = self.candidate(member), list(self.members[member].recordings)
         number = one.effect.amplitudes
-        known = self.terms[:, one.first : one.first + number].min(0)
+        known = self.terms[where, one.first : one.first + number].min(0)
         return -known if one.effect.positive else np.full(number, -np.inf)

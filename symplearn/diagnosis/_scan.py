@@ -263,7 +263,8 @@ def _scored(
         if k not in own:
             candidate = problem.candidate(told.member)
             effect, first = candidate.effect, candidate.first
-            known = first if problem.terms[:, first : first + effect.amplitudes].any() else None
+            # What is known may differ by recording, and so may how much of it can be taken back.
+            known = told.member if problem.terms[:, first : first + effect.amplitudes].any() else None
             alike.setdefault((effect.amplitudes, effect.positive, known), []).append(k)
     found = dict(own)
     for some in alike.values():
