@@ -9,6 +9,7 @@ from symplearn.diagnosis import _native_rows, _stochastic
 from symplearn.diagnosis._batched_steps import BatchedSteps
 from symplearn.diagnosis._lanes import Lanes
 from symplearn.diagnosis._native_steps import NativeSteps
+from symplearn.diagnosis._path_filter import prolonged
 from symplearn.diagnosis._problem import SLOTS
 from symplearn.diagnosis._stochastic import free_run
 from symplearn.diagnosis._trajectory import Stepper
@@ -117,6 +118,18 @@ def test_a_free_run_is_the_same_from_any_row(steppers, monkeypatch):
         assert one.shape == other.shape and len(one) == len(problem.rows[0].times) - 4
         # Round-off of a hundred substeps.
         assert compared(one, other) < 1e-10
+
+
+def test_a_path_is_prolonged_without_machine_code(steppers, monkeypatch):
+    """Held-out rows, to which a path runs on, are reached where the code cannot be written, too."""
+    native, _ = steppers
+    problem, z = native.problem, unknowns(native.problem, np.random.default_rng(3))
+    path = np.tile(z[: problem.state], (5, 1))
+    mine = prolonged(native, 0, z, (), path)
+    monkeypatch.setattr(_stochastic, "native_rows", lambda *some: None)
+    other = prolonged(native, 0, z, (), path)
+    assert other.shape == (len(problem.rows[0].times), problem.state)
+    np.testing.assert_allclose(other, mine, rtol=1e-10, atol=1e-12)  # round-off of a hundred substeps
 
 
 def test_the_answer_does_not_depend_on_the_threads(steppers):
