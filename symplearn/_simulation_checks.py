@@ -94,14 +94,7 @@ def _initial(table: SimulationTable, states: list[str], file: str) -> dict[str, 
             raise InputError(
                 f"{file}, {place(['initial', name])}: not a coordinate or momentum; {nearest(name, states)}"
             )
-    found = _quantities(table.initial, "initial", file)
-    for name, start in found.items():
-        if start.positive or start.lower is not None or start.upper is not None:
-            raise InputError(
-                f"{file}, {place(['initial', name])}: a start has no limits, but positive, lower or upper was given; "
-                "say what is known of it with value and sd"
-            )
-    return found
+    return _quantities(table.initial, "initial", file)
 
 
 def _forces(table: SimulationTable, names: Collection[str], file: str) -> dict[str, Expression]:

@@ -108,12 +108,6 @@ class TermReader:
         forbidden, needed = FORBIDDEN.get((word.name, name), (None, ""))
         if forbidden is not None and forbidden(result.value):
             raise InputError(f"{where}: {result.value:g} was given, but {name} of {word.name} must {needed}")
-        if word.name == "sensor_noise" and not result.known:
-            # A noise is known or estimated; nothing between the two is fitted.
-            raise InputError(
-                f"{where}: a table was given, but the factor of a noise is not calibrated; give a number, "
-                "or leave this term and the column's noise in [recording.noise] out to have the noise estimated"
-            )
         # What is calibrated stays so: a friction that is not there must not come back as one that drives.
         return result if result.known else replace(result, positive=result.positive or name in word.positive)
 

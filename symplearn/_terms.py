@@ -113,9 +113,9 @@ def _numbers(built: Mechanics, term: Term, number: int, names: Mapping[tuple[int
 
 
 def noise_factor(file: SimulationFile, column: str) -> float:
-    """By how much `sensor_noise` terms widen the noise of a column."""
-    own = [t for t in file.terms if t.effect == "sensor_noise" and t.target == (column,)]
-    return prod((t.coefficients["s"].value for t in own), start=1.0)
+    """By how much `sensor_noise` terms widen the noise of a column; NaN where one of them is calibrated."""
+    own = [t.coefficients["s"] for t in file.terms if t.effect == "sensor_noise" and t.target == (column,)]
+    return prod((s.value if s.known else float("nan") for s in own), start=1.0)
 
 
 def _check(file: SimulationFile, term: Term, number: int) -> None:

@@ -163,10 +163,6 @@ TOML = {
     .replace('target = "theta"', 'target = "angle"')
     .replace("c = 0.03", "s = 2")
     .replace("[recording.noise]\nangle = 0.01", ""),
-    "noise term with a prior": changed("c = 0.03", "s = { value = 1.0, sd = 0.2 }")
-    .replace("viscous_damping", "sensor_noise").replace('target = "theta"', 'target = "angle"'),
-    "positive start": changed("sd = 0.1 }", "sd = 0.1, positive = true }"),
-    "start with limits": changed("sd = 0.1 }", "lower = 0.5, upper = 1.5 }"),
 }  # fmt: skip
 
 
@@ -205,8 +201,6 @@ def test_wrong_simulation_files(text, tmp_path):
         ("integrator", r"\[integrator\] name: unknown word `leapfrg`; did you mean `leapfrog`"),
         ("force on coordinate", r"\[forces\] theta: a force changes a momentum.*use `p_theta`"),
         ("no time", r"\[recording\] time: missing; name the column of times"),
-        ("positive start", r"\[initial\] theta: a start has no limits.*say what is known of it with value and sd"),
-        ("noise term with a prior", r"\[\[terms\]\] 1 s: a table was given.*give a number, or leave this term and"),
     ],
 )
 def test_the_sentence_says_place_and_remedy(case, sentence):

@@ -5,7 +5,7 @@ import pytest
 from engine_cases import solved
 
 from symplearn import Recording, parse_simulation
-from symplearn._effects import EFFECTS, QUADRATIC, VISCOUS
+from symplearn._effects import EFFECTS, NOISE, QUADRATIC, VISCOUS
 from symplearn._errors import InputError
 from symplearn.diagnosis import Restriction
 from symplearn.diagnosis._build import augmented_equations, build
@@ -14,7 +14,7 @@ from symplearn.diagnosis._course import courses
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._stochastic import free_run
 from symplearn.diagnosis._trajectory import Stepper
-from symplearn.diagnosis._warnings import doubled
+from symplearn.diagnosis._warnings import doubled, unused
 
 TIMES = np.linspace(2.0, 8.0, 121)
 START = np.array([0.7, -0.4, 0.3, 0.5])
@@ -299,3 +299,18 @@ def test_as_much_is_taken_back_as_is_known_where_it_is():
     lowest = {key: problem.lowest(k) for key, k in of_y.items()}
     assert [lowest[VISCOUS, r].item() for r in ((0,), (1,), (0, 1))] == [-0.3, -0.1, -0.1]
     assert lowest[EFFECTS["linear_stiffness"], (0,)] == -np.inf and lowest[QUADRATIC, (0,)] == 0.0
+
+
+def test_what_is_not_used_of_a_file_is_told():
+    """Limits of a start, and what is known of the factor of a noise, which is estimated and searched no more."""
+    text = FILE.replace("[[terms]]", "[initial]\nx = { value = 1.0, sd = 0.1, lower = 0.5 }\ny = 0.2\n"
+                                     "[recording.noise]\nX = 0.1\nY = 0.1\n[[terms]]")  # fmt: skip
+    term = 'effect = "sensor_noise"\ntarget = "X"\n'
+    file = parse_simulation(f"{text}{term}s = {{ value = 1.0, sd = 0.2 }}", "known.toml")
+    limits, noise = unused(file)
+    assert limits.startswith("[initial] x has limits") and noise.startswith("the noise of X is estimated")
+    assert unused(parse_simulation(f"{text}{term}s = 3.0".replace(", lower = 0.5", ""), "known.toml")) == []
+    run = Recording(1, "1", ("X", "Y"), TIMES, np.zeros((len(TIMES), 2)), np.arange(len(TIMES)))
+    problem = build(file, augmented_equations(file, 2.0), [run], 0.0, 0.0125, Restriction())
+    looked_for = [problem.candidate(m).targets for m in problem.searched if problem.candidate(m).effect is NOISE]
+    assert looked_for == [("Y",)]

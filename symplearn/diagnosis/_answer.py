@@ -35,7 +35,7 @@ from ._record import Diagnosis, Forecast, Series
 from ._told import Told
 from ._trajectory import Stepper
 from ._units import coefficient_units, time_unit
-from ._warnings import doubled, idle_units, missed, set_back, warnings
+from ._warnings import doubled, idle_units, missed, set_back, unused, warnings
 from ._weighed import Estimate, coloured_inflation
 from ._words import equation_lines, finding_sentence
 
@@ -166,6 +166,7 @@ class Answer:
             "warnings": [*self.notes]
             + doubled(self.file)
             + idle_units(self.file)
+            + unused(self.file)
             + warnings(
                 self.problem,
                 self.recordings,

@@ -149,7 +149,7 @@ def _is_open(file: SimulationFile, candidate: Candidate) -> bool:
     if candidate.effect is OUTLIERS:
         return not _has_outliers(file, target)
     if candidate.effect is NOISE:
-        return target in file.recording.noise
+        return bool(np.isfinite(file.recording.noise.get(target, np.nan) * noise_factor(file, target)))
     if candidate.effect.acts_on != PARAMETER:
         return True
     quantity = file.parameters[target]

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from .._effects import NOISE
 from .._recording import Recording
 from .._simulation_records import SimulationFile
 from ._found import Found
@@ -188,6 +189,17 @@ def idle_units(file: SimulationFile) -> list[str]:
         for name in file.units
         if name not in known
     ]
+
+
+def unused(file: SimulationFile) -> list[str]:
+    """What the file says and nothing uses: limits of a start, and what is known of a calibrated noise."""
+    starts = [name for name, q in file.initial.items() if q.positive or q.lower is not None or q.upper is not None]
+    noises = [term.target[0] for term in file.terms if term.effect == NOISE.name and not term.coefficients["s"].known]
+    return [
+        *(f"[initial] {name} has limits, which are not kept: a start is known by its value and sd" for name in starts),
+        *(f"the noise of {column} is estimated, as if nothing were known of its factor in [[terms]]; give a number to "
+          "have it kept" for column in noises),
+    ]  # fmt: skip
 
 
 def _when(problem: Problem, recordings: Sequence[Recording], best: Estimate) -> str:
