@@ -1,5 +1,6 @@
 """Every law stands as a line with its numbers, and in the equations of motion where it acts."""
 
+import engine_cases as cases
 import pytest
 import sympy
 from finding_cases import EVERY, candidate, values
@@ -11,7 +12,7 @@ from sympy.parsing.sympy_parser import (
     standard_transformations,
 )
 
-from symplearn.diagnosis._law_text import equation_lines, law_text
+from symplearn.diagnosis._law_text import equation_lines, law_text, stated
 
 LAWS = {
     ("viscous_damping", None): "F = -0.0296 v",
@@ -122,6 +123,49 @@ def test_a_known_force_that_begins_with_a_minus_is_taken_away(known, line):
     """What is added to -dH/dq is one sum with it, whatever sign it begins with."""
     lines = equation_lines(["q"], ["p"], [], "p**2/2", {"p": known}, {}, [])
     assert lines[2] == f"dp/dt = -dH/dq {line}"
+
+
+def test_terms_of_the_file_stand_in_the_equations():
+    """What a simulation has already is part of its equations, with the recordings that it is in, of a force without a
+    name as of one with; before what is found and after."""
+    known = """
+[[terms]]
+effect = "viscous_damping"
+target = "x"
+c = 0.3
+recordings = [1, 3]
+[[terms]]
+effect = "contact_stop"
+side = "lower"
+target = "x"
+k = { value = 7.0, sd = 0.1 }
+a = -1.5
+[[terms]]
+effect = "unnamed_force"
+target = "x"
+expression = "-2*w"
+memory = { w = "x - w" }
+[[terms]]
+effect = "impulse"
+target = "x"
+j = 0.2
+t_star = 4.5
+recordings = [2]
+[[terms]]
+effect = "sensor_bias"
+target = "volt"
+b = 0.3
+"""
+    file = cases.simulation("p**2/2", ("x",), ("p",), {"volt": "x"}, known)
+    lines = equation_lines(("x",), ("p",), ("volt",), "p**2/2", {}, {"volt": "x"}, stated(file.terms))
+    assert lines == (
+        "H = p**2/2",
+        "dx/dt = dH/dp",
+        "dp/dt = -dH/dx - 0.3 dx/dt (recordings 1, 3 only) + 7 max(-1.5 - x, 0) + (-2*w)",
+        "dw/dt = x - w",
+        "p jumps by 0.2 at t = 4.5 (recording 2 only)",
+        "volt = x + 0.3",
+    )
 
 
 def test_equations_without_effects_are_the_simulation():

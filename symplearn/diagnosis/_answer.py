@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from .._effects import COORDINATE, IMPULSE, MEMORIES, OUTLIERS, PAIR, Candidate
+from .._simulation_records import SimulationFile
 from . import _document as document
 from ._along import along, energy, force
 from ._augment import augmented
@@ -14,6 +15,7 @@ from ._build import rows_fitted
 from ._effect_priors import STRENGTH
 from ._forecast import forecast
 from ._found import Found
+from ._law_text import equation_lines, stated
 from ._locate import (
     blows_sentence,
     kind_and_targets,
@@ -37,7 +39,7 @@ from ._trajectory import Stepper
 from ._units import coefficient_units, time_unit
 from ._warnings import doubled, idle_units, missed, set_back, unused, warnings
 from ._weighed import Estimate, coloured_inflation
-from ._words import equation_lines, finding_sentence
+from ._words import finding_sentence
 
 VERSION = "0.1.0"
 # How readings are off, by kind of remainder.
@@ -115,23 +117,30 @@ class Answer:
         return [Outlook(self.stepper, estimate, r, self.pull.intensity) for r in range(len(self.problem.rows))]
 
     def diagnosis(self, seconds: float) -> Diagnosis:
-        f, eq, told = self.file, self.problem.equations, self.told
+        f, eq = self.file, self.problem.equations
         forces = {p: e.text for p, e in f.forces.items()}
         readings = {c: e.text for c, e in f.recording.observe.items()}
         lines = (f.coordinates, f.momenta, eq.columns, f.hamiltonian.text, forces, readings)
+        calibrated = augmented(f, self.problem, self.found.priors, self.before, {}, {}, {})
+        whole = self._augmented()
         return Diagnosis(
             title=f.title,
             document=self._document(seconds),
             columns=eq.columns,
             coordinates=f.coordinates,
             units=f.units,
-            equation_before=equation_lines(*lines, []),
-            equation_after=equation_lines(*lines, told.chosen()),
+            equation_before=equation_lines(*lines, stated(calibrated.terms)),
+            equation_after=equation_lines(*lines, stated(whole.terms)),
             series=tuple(self._series(r) for r in range(len(self.recordings))),
-            augmented=augmented(
-                f, self.problem, self.found.priors, self.after, told.values, told.expressions, told.memories
-            ),
+            augmented=whole,
             forecast=self.forecast,
+        )
+
+    def _augmented(self) -> SimulationFile:
+        """The file with the findings put back."""
+        told = self.told
+        return augmented(
+            self.file, self.problem, self.found.priors, self.after, told.values, told.expressions, told.memories
         )
 
     @cached_property

@@ -4,7 +4,8 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from .._effects import RELAXING, SLIPPING, YIELDING, Candidate, Memory
+from .._effects import EFFECTS, RELAXING, SLIPPING, UNNAMED, YIELDING, Candidate, Memory
+from .._simulation_records import Term
 from .._vocabulary import COLUMN, PAIR, PARAMETER, symbol
 
 # What each effect adds to the force on its first and second coordinate (contract, section 3).
@@ -106,7 +107,7 @@ def equation_lines(
     scatter have a line of their own.
 
     **Arguments:** - `forces`: known forces by momentum. - `readings`: what the columns show. - `chosen`: effects with
-    the contract's coefficients.
+    the contract's coefficients, and with `recordings`, a text, where they are not in all.
     """
     chosen = list(chosen)
     added: dict[str, list[str]] = {q: [] for q in coordinates}
@@ -116,13 +117,34 @@ def equation_lines(
         values = {name: _shown(name, value) for name, value in coefficients.items()}
         names = _names(one, f"d{one.targets[0]}/dt", f"d{one.targets[-1]}/dt") | {"z": unseen.get(number_, "z")}
         for q, template in zip(one.targets, _FORCES.get(_key(one), ()), strict=False):
-            added[q].append(_filled(template, names | values | _composed(coefficients)))
+            added[q].append(_filled(template, names | values | _composed(coefficients)) + _only(coefficients))
         further += _own_lines(one, coefficients, names["z"], dict(zip(coordinates, momenta, strict=True)))
     lines = [f"H = {hamiltonian}"]
     for q, p in zip(coordinates, momenta, strict=True):
         known = [_appended(forces[p].strip())] if p in forces else []
         lines += [f"d{q}/dt = dH/d{p}", " ".join([f"d{p}/dt = -dH/d{q}", *known, *added[q]])]
     return (*lines, *further, *_parameter_lines(chosen), *_reading_lines(columns, readings, chosen))
+
+
+def stated(terms: Iterable[Term]) -> list[tuple[Candidate, dict[str, Any]]]:
+    """Terms of a simulation file as effects with their values, as the equations are written from."""
+    out = []
+    for term in terms:
+        values: dict[str, Any] = {name: quantity.value for name, quantity in term.coefficients.items()}
+        if term.expression is not None:
+            values["expression"] = term.expression.text
+        if term.memory:
+            values["memory"] = ", ".join(f"d{name}/dt = {rate.text}" for name, rate in term.memory.items())
+        if term.recordings is not None:
+            values["recordings"] = ", ".join(map(str, term.recordings))
+        out.append((Candidate(EFFECTS.get(term.effect, UNNAMED), term.target, (), term.side), values))
+    return out
+
+
+def _only(coefficients: Mapping[str, Any]) -> str:
+    """In which recordings it acts, where not in all."""
+    some = coefficients.get("recordings")
+    return f" (recording{'s' if ',' in some else ''} {some} only)" if some else ""
 
 
 def _appended(terms: str) -> str:
@@ -193,7 +215,7 @@ def _own_lines(one: Candidate, coefficients: Mapping[str, Any], unseen: str, mom
     """Lines that an effect of the dynamics adds to the equations."""
     if one.effect.name == "impulse":
         jump, when = number(coefficients["j"]), moment(coefficients["t_star"])
-        return [f"{momentum[one.targets[0]]} jumps by {jump} at t = {when}"]
+        return [f"{momentum[one.targets[0]]} jumps by {jump} at t = {when}{_only(coefficients)}"]
     if one.effect.name == "hidden_oscillator":
         square, kappa = number(coefficients["omega"] ** 2), number(coefficients["kappa"])
         return [f"d{unseen}/dt = P_{unseen}", f"dP_{unseen}/dt = -{square} {unseen} + {kappa} {one.targets[0]}"]

@@ -49,11 +49,6 @@ class Told:
         """What those that fade remember, by member: the rate of change of every name that is not the simulation's."""
         return {m: rates for m, (_, rates) in self._fading.items()}
 
-    def chosen(self) -> list[tuple[Candidate, Mapping[str, Any]]]:
-        """Every finding with its values, or its expression."""
-        named = [(self.problem.candidate(m), values) for m, values in self.values.items()]
-        return named + [(one, self._texts(m, one)) for m, some in self.expressions.items() for one in some]
-
     def of(self, member: int, one: Candidate) -> dict[str, Any]:
         """Coefficients of a finding on one coordinate; of a force without a name its expression, and how well its size
         is known where it has one."""

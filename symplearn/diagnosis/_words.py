@@ -8,9 +8,7 @@ from typing import Any
 from .._effects import DELAY, Candidate
 from .._vocabulary import PAIR, VOCABULARY
 from ._consequences import Said, consequence
-from ._law_text import equation_lines as equation_lines
-from ._law_text import law_text as law_text
-from ._law_text import symbolic_law, symbols
+from ._law_text import law_text, symbolic_law, symbols
 
 _OPENINGS = {
     "viscous_damping": "A force against the motion of {q}, proportional to its speed, was left out",
