@@ -1,6 +1,7 @@
 """Everything that is said about a finished search."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -122,7 +123,7 @@ class Answer:
         readings = {c: e.text for c, e in f.recording.observe.items()}
         lines = (f.coordinates, f.momenta, eq.columns, f.hamiltonian.text, forces, readings)
         calibrated = augmented(f, self.problem, self.found.priors, self.before, {}, {}, {})
-        whole = self._augmented()
+        whole = self._whole()
         return Diagnosis(
             title=f.title,
             document=self._document(seconds),
@@ -136,12 +137,11 @@ class Answer:
             forecast=self.forecast,
         )
 
-    def _augmented(self) -> SimulationFile:
-        """The file with the findings put back."""
-        told = self.told
-        return augmented(
-            self.file, self.problem, self.found.priors, self.after, told.values, told.expressions, told.memories
-        )
+    def _whole(self) -> SimulationFile:
+        """The file with the findings put back, and what is calibrated as well known as it is told."""
+        told, after = self.told, replace(self.after, covariance=self.after.covariance * self._spread())
+        texts = told.values, told.expressions, told.memories
+        return augmented(self.file, self.problem, self.found.priors, after, *texts)
 
     @cached_property
     def told(self) -> Told:
