@@ -103,6 +103,25 @@ def test_a_calibrated_term_is_split():
     np.testing.assert_allclose(both, [(0.31, 0.01), (0.51, 0.02)], rtol=1e-12)  # rounding
 
 
+def test_two_calibrated_terms_and_a_finding_are_one():
+    """Where two calibrated frictions act together, the sum has the variance of three errors, of which none goes with
+    another: 1e-4 (1 + 4 + 4)."""
+    file, p = posed(2 * (DAMPING + "c = { value = 0.1, sd = 0.1 }\n"))
+    member = damped(p, [1, 2])
+    e = estimated(p, (member,), [0.1, 0.2, 0.3], 1e-4 * np.diag([1.0, 4.0, 4.0]))
+    (term,) = put_back(file, p, e, {member: {"c": 0.3}})
+    c = term.coefficients["c"]
+    assert (c.value, c.sd) == pytest.approx((0.6, 0.03), rel=1e-12) and not c.known  # rounding
+
+
+def test_a_factor_of_a_noise_is_multiplied():
+    """A noise that is known to be twice as large as given, and found to be half as large again, is three times it."""
+    file, p = posed('[recording.noise]\ny = 0.1\n[[terms]]\neffect = "sensor_noise"\ntarget = "y"\ns = 2.0\n')
+    member = next(k for k in p.searched if p.candidate(k).effect.name == "sensor_noise")
+    (term,) = put_back(file, p, estimated(p, (member,), [], np.zeros((0, 0))), {member: {"s": 1.5}})
+    assert term.recordings is None and term.coefficients["s"].value == 3.0
+
+
 def test_what_is_too_strong_in_one_recording_alone_is_found():
     """A damping of 0.5 is known in the first recording, where it is 0.3 in truth, and none in the second, where there
     is none: that much of it is taken back, by SciPy's readings, and with the term of the sum nothing is left out."""

@@ -20,7 +20,7 @@ from ._weighed import Estimate
 
 @dataclass(frozen=True)
 class Put:
-    """A term as it is put back, and where in z its one coefficient stands where that is calibrated, or was found."""
+    """A term as it is put back, and where in z that of it stands which is calibrated, or was found."""
 
     term: Term
     places: tuple[int, ...] = ()
@@ -48,7 +48,7 @@ def augmented(
             parameters[name] = _recalibrated(parameters[name], float(z[k]), float(sd[k]))
     known, found = _recalibrated_terms(file, where, z, sd), dict(problem.placed(estimate.combination))
     for member, values in coefficients.items():
-        one = Put(_term(problem, member, values), (found[member].start,))
+        one = Put(_term(problem, member, values), tuple(range(found[member].start, found[member].stop)))
         known = merged(known, one, len(problem.rows), estimate.covariance)
     terms = [one.term for one in known]
     for member, some in expressions.items():
@@ -129,7 +129,7 @@ def _sum(known: Sequence[Put], new: Put, recordings: tuple[int, ...] | None, cov
     ((name, found),) = new.term.coefficients.items()
     parts, places = [one.term.coefficients[name] for one in known], [k for one in (*known, new) for k in one.places]
     every = [q.value for q in (*parts, found)]
-    # Factors of a noise are numbers, and none of them is calibrated.
+    # A wrong noise is looked for only where its factors are numbers, so that none of them is calibrated.
     value = math.prod(every) if new.term.effect == NOISE.name else math.fsum(every)
     sd = math.sqrt(max(0.0, covariance[np.ix_(places, places)].sum()))
     quantity = _allowed(parts, value, sd, name in VOCABULARY[new.term.effect].positive)
