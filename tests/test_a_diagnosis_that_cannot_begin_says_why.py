@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import engine_cases as cases
+import jax
 import numpy as np
 import pytest
 
@@ -111,6 +112,12 @@ def test_a_forecast_past_a_missing_input_is_refused():
     recording = cases.recorded(TIMES, np.cos(TIMES), inputs)
     assert "22: an input is missing" in refusal(driven, recording, Options(forecast_until=23.0))
     assert len(_times_ahead(driven, recording, Options(forecast_until=21.0))) > 0
+
+
+def test_single_precision_is_refused():
+    """In which nothing that is sought can be told; what to set is said."""
+    with jax.enable_x64(False):
+        assert 'jax.config.update("jax_enable_x64", True)' in refusal(swing(), read())
 
 
 def test_one_row_is_refused_before_its_forecast():
