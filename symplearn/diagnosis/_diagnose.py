@@ -4,7 +4,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError, shown
@@ -30,11 +30,11 @@ def diagnose(file: SimulationFile, recordings: Sequence[Recording], options: Opt
     It computes where JAX does, and is made for a processor: on a graphics card it takes more than four times as long.
     The command line sees to that; here `jax.config.update("jax_platforms", "cpu")` does, before anything is computed.
 
-    `InputError` where something else is given, as a path, simulation and recordings do not fit together, or JAX computes
-    in single precision.
+    `InputError` where something else is given, as a path, where simulation and recordings do not fit together, and
+    where JAX computes in single precision.
     """
     _refuse_paths(file, recordings, options)
-    if not jax.config.jax_enable_x64:
+    if jnp.zeros(()).dtype != np.float64:
         raise InputError(
             "`diagnose` computes in double precision, and JAX is set to single; call "
             '`jax.config.update("jax_enable_x64", True)` before it'
