@@ -10,8 +10,9 @@ from jaxtyping import Array, Float
 
 from ._errors import InputError
 from ._fit import Estimate
-from ._forecast_grid import input_rows, times_until
-from ._model import AbstractStateSpaceModel, Instant, intervals_between
+from ._forecast_grid import Grid, grid_of, stepped, substeps_of
+from ._model import AbstractStateSpaceModel, Instant, StateSpaceModel, intervals_between
+from ._noise import AdditiveGaussian, ScaledIdentity
 from ._objectives import MarginalLikelihood
 from ._parameters import resolve
 from ._transforms import AbstractTransform
@@ -43,13 +44,16 @@ class Forecast(eqx.Module):
 def forecast(estimate: Estimate, *, until: float | None = None, times: Any = None, inputs: Any = None) -> Forecast:
     """Forecast an estimate beyond its recording.
 
+    The state is stepped through the data's times, multiples of the recording's last interval after its end, whatever
+    `times` are. Noise that belongs to a data interval, as `AdditiveGaussian`, enters there; a `WienerIncrement` enters
+    everywhere.
+
     **Arguments:** give one of `until` - the last time, in steps of the recording's last interval; `times` -
     increasing times after the recording's last; and, of a driven model, `inputs` (time + 1, input), held from the
-    recording's last time and from each of the times after it. Process noise of `AdditiveGaussian` is added once per
-    forecast interval, so with it keep to the recording's spacing.
+    recording's last time and from each of the times after it.
 
-    **Raises:** `InputError` where not exactly one is given, times do not lie ahead, inputs do not fit, or the forecast
-    is not finite.
+    **Raises:** `InputError` where not exactly one is given, times do not lie ahead, inputs do not fit, dynamics that
+    are one step per data interval are asked for other times, or the forecast is not finite.
     """
     objective = estimate.objective if isinstance(estimate.objective, MarginalLikelihood) else MarginalLikelihood()
     series = estimate.recording
@@ -58,55 +62,47 @@ def forecast(estimate: Estimate, *, until: float | None = None, times: Any = Non
             f"`forecast` continues one recording, but the estimate is of {len(series)}: fit that one alone, or filter "
             "it with the estimate's model."
         )
-    ahead = _times_ahead(np.asarray(series.times), until, times)
+    grid = grid_of(estimate.model, series, times, until, in_sample=False, inputs=inputs)
+    model = stepped(resolve(estimate.model), substeps_of(estimate.model, grid, None))
     filtered = objective.filter(estimate.model, series)
-    grid = jnp.concatenate([series.times[-1:], jnp.asarray(ahead)])
     start = filtered.filtered_means[-1], filtered.filtered_covariances[-1]
-    rows = input_rows(series, inputs, len(grid))
-    result = _push_forward(resolve(estimate.model), objective.transform, grid, rows, *start)
+    result = _push_forward(model, objective.transform, grid, *start)
     if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in (*jax.tree.leaves(result), *start)):
-        raise InputError(f"The forecast is not finite before t = {ahead[-1]:g}: the model escapes. Forecast less far.")
-    return result
-
-
-def _times_ahead(recorded: np.ndarray, until: float | None, times: Any) -> np.ndarray:
-    if (until is None) == (times is None):
-        raise InputError("`forecast` needs either `until` or `times`, and not both.")
-    last, spacing = recorded[-1], recorded[-1] - recorded[-2]
-    if times is None:
-        times = times_until(float(until or 0.0), last, spacing)
-    ahead = np.asarray(times, dtype=float)
-    if (
-        ahead.ndim != 1
-        or len(ahead) == 0
-        or not np.isfinite(ahead).all()
-        or not np.all(np.diff(np.concatenate([[last], ahead])) > 0)
-    ):
         raise InputError(
-            f"A forecast needs finite, increasing times after the recording's last, {last:g}; "
-            f"one interval is {spacing:g}."
+            f"The forecast is not finite before t = {grid.times[-1]:g}: the model escapes. Forecast less far."
         )
-    return ahead
+    return result
 
 
 @eqx.filter_jit
 def _push_forward(
-    model: AbstractStateSpaceModel, transform: AbstractTransform, grid: Array, inputs: Any, m: Array, P: Array
-):
-    known, instants = jnp.zeros_like(P), Instant(grid[1:], None if inputs is None else inputs[1:])
+    model: AbstractStateSpaceModel, transform: AbstractTransform, grid: Grid, m: Array, P: Array
+) -> Forecast:
+    known, quiet = jnp.zeros_like(P), _without_process_noise(model, len(m))
+
+    def moved(model, interval, x, m, root):
+        moments = model.predict(transform, m, root, interval)
+        # From a point, without a spread, the moments' mean is the deterministic path.
+        return model.predict(transform, x, known, interval).mean, moments.mean, triangularise(moments.factor)[0]
 
     def step(carry, data):
-        interval, instant = data
-        x, m, root = carry
-        moments = model.predict(transform, m, root, interval)
-        m, root = moments.mean, triangularise(moments.factor)[0]
-        # From a point, without a spread, the moments' mean is the deterministic path.
-        x = model.predict(transform, x, known, interval).mean
+        interval, instant, noisy = data
+        x, m, root = jax.lax.cond(noisy, lambda: moved(model, interval, *carry), lambda: moved(quiet, interval, *carry))
         read = model.read(transform, m, root, instant)
         path = model.read(transform, x, known, instant).mean
         sd = jnp.sqrt(jnp.diagonal(read.covariance))
         return (x, m, root), (path, read.mean, sd, x, m, root @ root.T)
 
+    times, held = jnp.asarray(grid.times), None if grid.inputs is None else jnp.asarray(grid.inputs)
+    instants = Instant(times[1:], None if held is None else held[1:])
     start = m, m, semidefinite_cholesky(P)
-    _, ahead = jax.lax.scan(step, start, (intervals_between(grid, inputs), instants))
-    return Forecast(grid[1:], *ahead)
+    _, ahead = jax.lax.scan(step, start, (intervals_between(times, held), instants, grid.noisy))
+    return jax.tree.map(lambda leaf: leaf[grid.wanted - 1], Forecast(times[1:], *ahead))
+
+
+def _without_process_noise(model: Any, size: int) -> Any:
+    """The model between the times at which noise enters; one that does not say how its noise does keeps it."""
+    if not isinstance(model, StateSpaceModel):
+        return model
+    silent = AdditiveGaussian(ScaledIdentity(0.0, dim=size))
+    return eqx.tree_at(lambda m: m.process_noise, model, silent)

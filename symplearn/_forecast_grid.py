@@ -1,8 +1,10 @@
 """When paths are pushed forward: the times asked for and, between them, those at which noise enters or was read."""
 
+import dataclasses
 import math
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -37,6 +39,7 @@ def grid_of(
     """
     wanted = _wanted(series, times, until, in_sample)
     recorded = np.asarray(series.times)
+    _refuse_far(float(wanted[-1]), float(recorded[-1]), float(recorded[-1] - recorded[-2]))
     spacing, slack = float(recorded[-1] - recorded[-2]), 1e-9 * float(recorded[-1] - recorded[-2])
     start = recorded[0] if in_sample else recorded[-1]
     later = recorded[-1] + spacing * np.arange(1, max(0, math.floor((wanted[-1] - recorded[-1]) / spacing + 1e-6)) + 1)
@@ -74,13 +77,17 @@ def times_until(until: float, start: float, spacing: float) -> Float[np.ndarray,
 
     **Raises:** `InputError` where `until` is not finite, or they are more than can be held.
     """
-    if not math.isfinite(until) or (until - start) / spacing > _MOST_TIMES:
-        raise InputError(
-            f"`until` = {until:g} is not within {_MOST_TIMES:,} intervals of {spacing:g} after t = {start:g}; "
-            "forecast less far, or give `times`."
-        )
+    _refuse_far(until, start, spacing)
     # The small share lets `until` itself be reached in spite of round-off.
     return start + spacing * np.arange(1, math.floor((until - start) / spacing + 1e-6) + 1)
+
+
+def _refuse_far(last: float, start: float, spacing: float) -> None:
+    if not math.isfinite(last) or (last - start) / spacing > _MOST_TIMES:
+        raise InputError(
+            f"The last time, {last:g}, is not within {_MOST_TIMES:,} intervals of {spacing:g} after t = {start:g}; "
+            "forecast less far."
+        )
 
 
 def _held(grid: Grid, series: TimeSeries, inputs: Any) -> Any:
@@ -135,3 +142,10 @@ def substeps_of(model: Any, grid: Grid, substeps: int | None) -> int | None:
             "apart, or give the model dynamics in continuous time."
         )
     return None
+
+
+def stepped(model: Any, substeps: int | None) -> Any:
+    """The model with as many substeps; None leaves it as it is."""
+    if substeps is None:
+        return model
+    return eqx.tree_at(lambda m: m.dynamics, model, dataclasses.replace(model.dynamics, substeps=substeps))

@@ -11,7 +11,7 @@ from jaxtyping import Array
 from ._errors import InputError
 from ._filter import unscented_filter
 from ._fit import Estimate
-from ._forecast_grid import Grid, grid_of, substeps_of
+from ._forecast_grid import Grid, grid_of, stepped, substeps_of
 from ._model import Instant, Interval
 from ._objectives import MarginalLikelihood, TimeSeries, as_recordings, one_of, prepare
 from ._parameters import resolve
@@ -95,9 +95,7 @@ def _path(task, model, key):
     def drawn(k, key):
         return means[k] + roots[k] @ jax.random.normal(key, means[k].shape) if choice.spread else means[k]
 
-    model = own_parts(model)
-    if task.substeps is not None:
-        model = eqx.tree_at(lambda m: m.dynamics, model, dataclasses.replace(model.dynamics, substeps=task.substeps))
+    model = stepped(own_parts(model), task.substeps)
 
     def step(x, data):
         interval, noisy, reading, key = data
