@@ -23,7 +23,7 @@ from ._model import (
     slice_at,
 )
 from ._parameters import resolve
-from ._transforms import STANDARD, AbstractTransform, Taylor
+from ._transforms import STANDARD, AbstractTransform, Moments, Taylor
 
 
 def _array_or_none(rows: Any) -> Array | None:
@@ -234,7 +234,15 @@ def _given_first(model: Any, reading: Array, instant: Instant) -> Gaussian:
         )
     _refuse_unread(reading)
     nothing = jnp.zeros((reading.shape[0], reading.shape[0]))
-    return Gaussian(reading, model.read(Taylor(), reading, nothing, instant).covariance)
+
+    def read(state: Array) -> Moments:
+        return model.read(Taylor(), state, nothing, instant)
+
+    # What noise of a mean of its own adds to a reading, and multiplies it by: 0 and 1 for most.
+    added = read(jnp.zeros_like(reading)).mean
+    factor = read(jnp.ones_like(reading)).mean - added
+    state = (reading - added) / factor
+    return Gaussian(state, read(state).covariance / jnp.outer(factor, factor))
 
 
 def _refuse_unread(reading: Array) -> None:

@@ -9,9 +9,10 @@ import pytest
 from scipy import stats
 
 import integrators as ig
+from symplearn._distributions import MultivariateNormal
 from symplearn._log_posterior import negative_log_posterior
 from symplearn._model import Coordinates, FullState, Gaussian, LinearDynamics, Propagator, StateSpaceModel
-from symplearn._noise import AdditiveGaussian, Dense, ScaledIdentity
+from symplearn._noise import Additive, AdditiveGaussian, Dense, Multiplicative, ScaledIdentity
 from symplearn._objectives import MARGINAL_LIKELIHOOD, TimeSeries
 from symplearn._parameters import Frozen, Learnt, flatten
 from symplearn._prior import Flat, Normal, Prior
@@ -126,3 +127,27 @@ def test_a_nonlinear_start_is_learnt_by_its_trajectory():
     expected = np.nansum(stats.norm(0.0, 0.1).logpdf(residuals))
     found = -SCORE(given, TimeSeries(jnp.asarray(times), jnp.asarray(ys)))
     assert float(found) == pytest.approx(expected, rel=1e-12)
+
+
+OFFSET, FACTOR, VARIES = np.array([0.5, -0.3]), np.array([2.0, 0.8]), np.diag([0.02, 0.01])
+BIASED = Additive(MultivariateNormal(OFFSET, Dense(R)))
+
+
+@pytest.mark.parametrize(
+    ("noise", "factor", "varies"),
+    [
+        (BIASED, np.ones(2), np.zeros((2, 2))),
+        (Multiplicative(MultivariateNormal(FACTOR, Dense(VARIES)), BIASED), FACTOR, VARIES),
+    ],
+    ids=["added", "multiplied and added"],
+)
+def test_without_a_start_the_first_reading_is_freed_of_its_noises_mean(noise, factor, varies):
+    """Under a flat prior the state given y = w x + eta is (y - E eta) / E w, with the variance of the noise there
+    divided by E w E w'."""
+    one = eqx.tree_at(lambda m: m.measurement_noise, model(None), noise)
+    found = MARGINAL_LIKELIHOOD.filter(one, SERIES)
+    state = (YS[0] - OFFSET) / factor
+    variance = (np.outer(state, state) * varies + R) / np.outer(factor, factor)
+    # Round-off of order one. Seen: 2e-16
+    np.testing.assert_allclose(found.filtered_means[0], state, atol=1e-14)
+    np.testing.assert_allclose(found.filtered_covariances[0], variance, atol=1e-14)
