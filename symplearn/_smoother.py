@@ -23,11 +23,12 @@ _NUDGE = 1e-5
 class Smoothed(eqx.Module):
     """The state and the noises given the whole recording, at n readings and over n - 1 data intervals.
 
-    `disturbances` are E[xi_k | Y] for x_{k+1} = Psi(x_k) + xi_k and `residuals` E[eta_k | Y] for
-    y_k = h(x_k) + eta_k; their `*_covariances` are those of the noises given Y. The `standardised_*` are
-    divided by the standard deviation of the estimate itself: each is N(0, 1) where the model is right, one
-    series per state equation and one per channel. They exist without process noise too, as limits. Harvey
-    and Koopman (1992). Residuals of missing readings are 0; see `observed`.
+    `disturbances` are E[xi_k | Y] for x_{k+1} = E[x_{k+1} | x_k] + xi_k and `residuals` E[eta_k | Y] for
+    y_k = E[y_k | x_k] + eta_k, so that noise of a mean of its own counts from there; their `*_covariances` are those of
+    the noises given Y. The `standardised_*` are divided by the standard deviation of the estimate itself: each is
+    N(0, 1) where the model is right, one series per state equation and one per channel. They exist without process
+    noise too, as limits. Harvey and Koopman (1992). Of a missing reading, see `observed`, the standardised residual is
+    0, and the residual what noise correlated with the other channels' says of it.
     """
 
     means: Float[Array, "time state"]

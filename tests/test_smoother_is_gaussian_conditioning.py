@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import integrators as ig
+from symplearn._distributions import MultivariateNormal
 from symplearn._filter import unscented_filter
 from symplearn._model import Coordinates, Gaussian, Propagator, StateSpaceModel, intervals_between
-from symplearn._noise import AdditiveGaussian, Dense
+from symplearn._noise import Additive, AdditiveGaussian, Dense
 from symplearn._smoother import smooth
 from symplearn._transforms import STANDARD, UnscentedTransform
 
@@ -43,14 +44,28 @@ def test_everything_smoothed_is_the_joint_gaussian_conditioned(alpha, tolerance)
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=tolerance, err_msg=name)
     seen = ~np.isnan(ys)
     assert np.array_equal(np.asarray(found.observed), seen)
-    for name in ("residuals", "standardised_residuals"):
-        np.testing.assert_allclose(
-            np.asarray(getattr(found, name))[seen],
-            getattr(expected, name)[seen],
-            atol=tolerance,
-            err_msg=name,
-        )
-        assert not np.any(np.asarray(getattr(found, name))[3])
+    # Of a missing channel the other's residual tells, as their noises are correlated; of a missing row nothing does.
+    np.testing.assert_allclose(found.residuals, expected.residuals, atol=tolerance)
+    assert found.residuals[7, 0] != 0 and not np.any(found.residuals[3])
+    np.testing.assert_allclose(
+        found.standardised_residuals, np.where(seen, expected.standardised_residuals, 0.0), atol=tolerance
+    )
+
+
+def test_noises_count_from_their_means():
+    """Where both noises have a mean of their own, disturbances and residuals are those of the same noises about 0."""
+    A, H, Q, R, m0, P0 = system = cases.linear_system()
+    ys, drift, offset = recorded(system), np.array([0.3, -0.2, 0.1]), np.array([0.5, -0.4])
+    noises = (Additive(MultivariateNormal(mean, Dense(matrix))) for mean, matrix in ((drift, Q), (offset, R)))
+    plain = cases.as_model(*system)
+    shifted = StateSpaceModel(plain.dynamics, plain.observation, *noises, plain.initial)
+    # What the drift adds to the states is known, and so is what it adds to the readings.
+    added = [np.zeros(3)]
+    for _ in range(N - 1):
+        added.append(A @ added[-1] + drift)
+    found, expected = smoothed(shifted, ys + np.array(added) @ H.T + offset), smoothed(plain, ys)
+    for name in ("disturbances", "standardised_disturbances", "residuals", "standardised_residuals"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-11, err_msg=name)
 
 
 def test_without_process_noise_disturbances_are_scores():
