@@ -99,12 +99,14 @@ def _path(task, model, key):
 
     def step(x, data):
         interval, noisy, reading, key = data
+        # Two keys of one split: a number folded in may be the key that a noise splits off its own.
+        key, start_key = jax.random.split(key) if choice.filtered else (key, key)
         x = model.dynamics(x, interval)
         if choice.process_noise:
             x = jnp.where(noisy, draw_noise(model.process_noise, x, interval, key), x)
         if not choice.filtered:
             return x, x
-        return jnp.where(reading >= 0, drawn(reading, jax.random.fold_in(key, 1)), x), x
+        return jnp.where(reading >= 0, drawn(reading, start_key), x), x
 
     inputs = grid.inputs
     intervals = Interval(grid.times[:-1], grid.times[1:], None if inputs is None else inputs[:-1])
