@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from ._small_products import product
 
+# In double precision; another's are as many times its own round-off.
 # Squared length of what is left of a row, over that of the row: below it, only round-off is left.
 _SPENT = 1e-26
 # A pivot below this share of its diagonal entry is round-off of a singular covariance: its column is dropped.
@@ -26,6 +27,11 @@ _FEW_ROWS = 12
 _MANY_ROWS, _PANEL = 128, 32
 # Beyond so many a triangle no longer fits the fast memory, and LAPACK's inverse of 804 rows took a sixth of the loop's.
 _LARGE = 512
+
+
+def _coarser(array: Array) -> float:
+    """The round-off of an array's numbers, over that of double precision."""
+    return float(jnp.finfo(array.dtype).eps / jnp.finfo(np.float64).eps)
 
 
 def triangularise(rows: Float[Array, "size column"]) -> tuple[Float[Array, "size size"], Bool[Array, " size"]]:
@@ -69,6 +75,7 @@ def _row_by_row(rows):
     triangle: list[Array] = []
     directions: list[Array] = []
     good: list[Array] = []
+    spent = _SPENT * _coarser(rows) ** 2
     for rest in rows:
         # Rows of very different size are the rule, a precise channel beside a coarse one: each is judged by its own.
         scale = jnp.sum(rest * rest)
@@ -77,7 +84,7 @@ def _row_by_row(rows):
             entries.append(jnp.sum(rest * direction))
             rest = rest - entries[-1] * direction
         square = jnp.sum(rest * rest)
-        good.append(square > _SPENT * scale)
+        good.append(square > spent * scale)
         length = jnp.sqrt(jnp.where(good[-1], square, 1.0))
         directions.append(jnp.where(good[-1], rest / length, 0.0))
         later = [jnp.zeros_like(length)] * (len(rows) - len(good))
@@ -87,13 +94,13 @@ def _row_by_row(rows):
 
 def _column_by_column(rows, scales):
     """For more rows: each frees all later ones of itself. `scales` are the squared lengths that they began with."""
-    size = rows.shape[0]
+    size, spent = rows.shape[0], _SPENT * _coarser(rows) ** 2
 
     def column(rest, data):
         j, here, below, scale = data
         row = _entry(rest, j)
         square = product(row, row)
-        good = square > _SPENT * scale
+        good = square > spent * scale
         length = jnp.sqrt(jnp.where(good, square, 1.0))
         direction = jnp.where(good, row / length, 0.0)
         entries = jnp.where(below, product(rest, direction), 0.0)
@@ -187,19 +194,20 @@ def lower_inverse(L: Float[Array, "size size"]) -> Float[Array, "size size"]:
 def semidefinite_cholesky(covariance: Float[Array, "state state"]) -> Float[Array, "state state"]:
     """Lower Cholesky factor of a covariance that may be singular, or zero; differentiable.
 
-    A column whose pivot is below 1e-14 of its diagonal entry is set to zero, together with its derivative. A matrix
-    that is clearly indefinite gives NaN, which the filter reports.
+    A column whose pivot is below 1e-14 of its diagonal entry, in double precision, is set to zero, together with its
+    derivative. A matrix that is clearly indefinite gives NaN, which the filter reports.
     """
     size = covariance.shape[0]
     order = np.arange(size)
+    singular, indefinite = _SINGULAR * _coarser(covariance), _INDEFINITE * _coarser(covariance) ** 0.5
     scales = jax.lax.stop_gradient(jnp.abs(jnp.diagonal(covariance)))
 
     def column(rest, j):
         # `rest` stays symmetric.
         row, scale = _entry(rest, j), _entry(scales, j)
         pivot, below = _entry(row, j), jnp.where(order >= j, row, 0.0)
-        good = pivot > _SINGULAR * scale
-        spoilt = ~good & jnp.any(jnp.abs(below) > _INDEFINITE * jnp.sqrt(scales * scale))
+        good = pivot > singular * scale
+        spoilt = ~good & jnp.any(jnp.abs(below) > indefinite * jnp.sqrt(scales * scale))
         root = jnp.sqrt(jnp.where(good, pivot, 1.0))
         entries = jnp.where(good, below / root, jnp.where(spoilt, jnp.nan, 0.0))
         return rest - jnp.outer(entries, entries), entries

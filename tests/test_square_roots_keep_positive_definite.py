@@ -154,3 +154,20 @@ def test_factors_of_semidefinite_matrices():
     assert not np.any(semidefinite_cholesky(jnp.zeros((3, 3))))
     for wrong in ([[1.0, 2.0], [2.0, 1.0]], [[0.0, 1.0], [1.0, 0.0]], [[-1.0, 0.0], [0.0, 1.0]]):
         assert bool(jnp.any(jnp.isnan(semidefinite_cholesky(jnp.array(wrong)))))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("rows", [3, 20, 140])
+def test_round_off_is_no_pivot_in_either_precision(rows, dtype):
+    """The last row, a sum of two others that rounds, adds no pivot in single precision either, and all others do; and
+    the covariance of such rows has a factor, with a column of zeros, where an indefinite one has none."""
+    M = np.random.default_rng(rows).normal(size=(rows, rows + 9)).astype(dtype)
+    M[-1] = dtype(0.3) * M[0] + dtype(0.7) * M[1]
+    L, good = triangularise(jnp.asarray(M))
+    assert L.dtype == dtype and good.tolist() == [True] * (rows - 1) + [False]
+    P = M[[0, 1, -1]] @ M[[0, 1, -1]].T
+    root = np.asarray(semidefinite_cholesky(jnp.asarray(P)))
+    assert root.dtype == dtype and not np.any(root[:, 2])
+    # What is dropped is round-off of the products.
+    np.testing.assert_allclose(root @ root.T, P, atol=10 * np.finfo(dtype).eps * np.abs(P).max())
+    assert np.any(np.isnan(semidefinite_cholesky(jnp.array([[1.0, 1.1], [1.1, 1.0]], dtype))))
