@@ -19,8 +19,9 @@ from ._counts import refuse_count
 from ._errors import InputError
 from ._guard import guard
 from ._model import FullState, Propagator, StateSpaceModel
-from ._objectives import AbstractObjective, TimeSeries, as_recordings, refuse_other_dimension, refuse_wrong_state
+from ._objectives import AbstractObjective, TimeSeries, as_recordings
 from ._parameters import require, resolve
+from ._suitability import refuse_other_dimension, refuse_wrong_state
 from ._trajectory_objectives import bounded
 
 # Singular values below this share of the largest are round-off of features that are dependent.

@@ -7,9 +7,10 @@ import numpy as np
 
 from ._errors import InputError
 from ._noise import AdditiveGaussian
-from ._objectives import TimeSeries, refuse_wrong_state
+from ._objectives import TimeSeries
 from ._parameters import named_parameters
 from ._starts import polynomial_of
+from ._suitability import refuse_wrong_state
 
 # BFGS holds a square matrix of this size for each start.
 _MOST_PARAMETERS = 1500

@@ -18,10 +18,9 @@ from ._guard import guard
 from ._model import Coordinates, FullState, LinearDynamics, LinearObservation, StateSpaceModel, intervals_between
 from ._objectives import TimeSeries, as_recordings, one_of
 from ._parameters import resolve
+from ._suitability import UNEVEN
 
 _LINEAR = LinearObservation | FullState | Coordinates
-# Rounded time stamps are uneven by less than this share of the spacing; a row that is left out by far more.
-_UNEVEN = 0.05
 
 
 class MarkovParameters(eqx.Module):
@@ -231,7 +230,7 @@ def check_spacing(series: TimeSeries) -> None:
         return
     spans = np.diff(np.asarray(series.times))
     usual = np.median(spans)
-    if np.max(np.abs(spans - usual)) > _UNEVEN * usual:
+    if np.max(np.abs(spans - usual)) > UNEVEN * usual:
         raise InputError(
             f"Markov parameters need evenly spaced rows, but the recording's intervals run from {spans.min():.4g} to "
             f"{spans.max():.4g}; put rows with NaN readings where some were left out, or resample."

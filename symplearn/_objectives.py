@@ -18,11 +18,11 @@ from ._model import (
     Gaussian,
     Instant,
     Interval,
-    Propagator,
     intervals_between,
     slice_at,
 )
 from ._parameters import resolve
+from ._suitability import refuse_unsuited, refuse_wrong_state
 from ._transforms import STANDARD, AbstractTransform, Moments, Taylor
 
 
@@ -107,6 +107,7 @@ class AbstractObjective(eqx.Module):
 
     def refuse(self, model: Any, recordings: tuple[TimeSeries, ...]) -> None:
         """Refuse, with `InputError`, what a value makes impossible to score and compiled code could not say."""
+        refuse_unsuited(model, recordings)
 
     def __call__(self, model: Any, recording: Any) -> Float[Array, ""]:
         """Minus the log density of the recording, or of independent recordings in a list or tuple: their sum."""
@@ -145,13 +146,17 @@ class MarginalLikelihood(AbstractObjective):
         return -log_likelihood(*prepare(model, series), transform=self.transform, passage=self.passage)
 
     def refuse(self, model: AbstractStateSpaceModel, recordings: tuple[TimeSeries, ...]) -> None:
+        super().refuse(model, recordings)
         if model.initial is None:
             for series in recordings:
                 _refuse_unread(series.readings[0])
 
     def filter(self, model: AbstractStateSpaceModel, recording: Any) -> Filtered:
-        """The filter's history behind the score of one recording."""
-        series = as_time_series(recording)
+        """The filter's history behind the score of one recording.
+
+        **Raises:** `InputError` where the model has not one initial distribution, or the recording does not suit it.
+        """
+        model, series = one_of(model, 0, 1), as_time_series(recording)
         self.refuse(model, (series,))
         return _filter(model, series, self)
 
@@ -183,29 +188,6 @@ def prepare(
 
 def _is_none(node: Any) -> bool:
     return node is None
-
-
-def refuse_wrong_state(model: Any, size: int) -> None:
-    """Refuses, with `InputError`, a state whose size is not that of the Hamiltonian's phase points."""
-    dynamics = getattr(model, "dynamics", None)
-    if not isinstance(dynamics, Propagator):
-        return
-    refuse_other_dimension(getattr(dynamics.system, "hamiltonian", dynamics.system), size)
-    if size % 2:
-        raise InputError(
-            f"The size of the state is {size}, but a phase point has a momentum for each coordinate; where only some "
-            "are read, say so by `observation=Coordinates(...)` and give `initial=Gaussian(mean, covariance)` of all."
-        )
-
-
-def refuse_other_dimension(hamiltonian: Any, size: int) -> None:
-    """Refuses, with `InputError`, a state whose size is not twice the Hamiltonian's `dim`, where that is known."""
-    dim = getattr(hamiltonian, "dim", None)
-    if isinstance(dim, int) and size != 2 * dim:
-        raise InputError(
-            f"The Hamiltonian is of {dim} degrees of freedom, so a phase point has {2 * dim} numbers, but the state "
-            f"has {size}; make `dim` half of it."
-        )
 
 
 def _check_channels(model: Any, state: int, channels: int, instant: Instant) -> None:

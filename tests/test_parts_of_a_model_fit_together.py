@@ -207,6 +207,9 @@ PENDULUM = sl.StateSpaceModel(
 WIDE = sl.TimeSeries(np.arange(5.0), np.ones((5, 4)))
 UNREAD = sl.TimeSeries(np.arange(5.0), np.array([[np.nan, 1.0], *[[1.0, 1.0]] * 4]))
 EMPTY = sl.TimeSeries(np.arange(5.0), np.full((5, 2), np.nan))
+GAP = sl.TimeSeries(np.array([0.0, 1.0, 2.0, 4.0]), np.ones((4, 1)))
+PUSHED = sl.TimeSeries(np.arange(5.0), np.ones((5, 2)), np.ones((5, 1)))
+STARTS = eqx.tree_at(lambda m: m.initial, model(), (sl.Gaussian(np.zeros(2), np.eye(2)),) * 2)
 TRAINING = {"prior": sl.Flat(), "epochs": 1, "key": jax.random.key(0)}
 
 
@@ -228,14 +231,68 @@ RECORDED = {
     "a start to fit": (lambda: sl.fit(PENDULUM, UNREAD, prior=sl.Flat()), "first row has missing readings"),
     "a start to learn": (lambda: sl.learn(PENDULUM, UNREAD, prior=sl.Flat()), "first row has missing readings"),
     "a start to filter": (lambda: sl.MarginalLikelihood().filter(PENDULUM, UNREAD), "first row has missing readings"),
+    "a row left out": (lambda: sl.MarginalLikelihood().filter(model(), GAP), "all intervals must be equal, .* 1 to 2;"),
+    "a row left out of a fit": (
+        lambda: sl.fit(model(sl.LinearDynamics(sl.Learnt(A))), GAP, prior=sl.Flat()),
+        "all intervals must be equal",
+    ),
+    "a system that is pushed": (
+        lambda: sl.MarginalLikelihood().filter(PENDULUM, PUSHED),
+        "has inputs, which `Propagator` .* would ignore",
+    ),
+    "dynamics without B": (
+        lambda: sl.fit(model(sl.LinearDynamics(sl.Learnt(A)), sl.FullState()), PUSHED, prior=sl.Flat()),
+        "has inputs, which `LinearDynamics` .* would ignore",
+    ),
+    "several starts": (lambda: sl.MarginalLikelihood().filter(STARTS, RECORDING), "has 2 initial distributions"),
 }
 
 
 @pytest.mark.parametrize("use, said", RECORDED.values(), ids=RECORDED.keys())
 def test_recordings_fit_the_model(use, said):
-    """A recording of other widths, without a first reading or without any is refused before anything is compiled."""
+    """A recording of other widths or intervals, with inputs that nothing takes, without a first reading or without any
+    is refused before anything is compiled."""
     with pytest.raises(InputError, match=said):
         use()
+
+
+class Carried(ig.AbstractSeparableHamiltonian):
+    """A frame that is moved: a system that changes with time, and may know the inputs."""
+
+    now: float = 0.0
+
+    def kinetic(self, p):
+        return 0.5 * p @ p
+
+    def potential(self, q):
+        return 0.5 * (q - self.now) @ (q - self.now)
+
+    def at(self, t):
+        return Carried(t)
+
+
+class Pushed(eqx.Module):
+    """x' = A x + u: a map of one's own, which takes the interval."""
+
+    def __call__(self, x, interval):
+        return A @ x + interval.input
+
+
+@pytest.mark.parametrize(
+    "dynamics", [sl.Propagator(Carried(), ig.Leapfrog()), Pushed(), sl.LinearDynamics(A, np.eye(2, 1))]
+)
+def test_inputs_that_may_be_known_are_let_through(dynamics):
+    """Inputs are no fault where the dynamics takes them, or may: a map of one's own, a system that changes with time;
+    nor is a clock that is rounded."""
+    times = np.array([0.0, 0.033, 0.067, 0.1, 0.133])  # thirty rows a second, in milliseconds
+    pushed = sl.TimeSeries(times, np.ones((5, 2)), np.ones((5, 1)))
+    assert bool(sl.MarginalLikelihood().filter(two_read(dynamics), pushed).ok)
+
+
+def two_read(dynamics):
+    """The linear model with both numbers read."""
+    both = sl.AdditiveGaussian(sl.ScaledIdentity(0.1, dim=2))
+    return eqx.tree_at(lambda m: m.measurement_noise, model(dynamics, sl.FullState()), both)
 
 
 def test_strengths_of_binding_are_numbers():
