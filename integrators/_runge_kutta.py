@@ -117,6 +117,9 @@ class ImplicitMidpoint(AbstractIntegrator):
         t: Time,
         dt: Time,
     ) -> Float[Array, "n ..."]:
+        if state.ndim > 1:
+            # Of points side by side each has its own equations: one system of all would grow with their square.
+            return jax.vmap(lambda x: self.flow(hamiltonian, x, t, dt), in_axes=1, out_axes=1)(state)
         field = hamiltonian.at(t + 0.5 * dt).vector_field
 
         def residual(middle: Float[Array, "n ..."]) -> Float[Array, "n ..."]:

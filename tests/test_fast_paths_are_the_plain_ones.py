@@ -105,8 +105,9 @@ def test_many_steps_are_the_steps_one_by_one(system, integrator):
         (sl.Polynomial(1, 3, 0.1 * np.sin(np.arange(9.0))), ig.Tao()),
         (sl.Polynomial(1, 2, 0.1 * np.arange(5.0)), ig.Tao(projection=ig.FirstCopy())),
         (HenonHeiles(), ig.RK2()),
+        (sl.PolynomialPotential(1, 3, 0.1 * np.arange(3.0)), ig.ImplicitMidpoint()),
     ],
-    ids=["leapfrog", "composed, Legendre", "Tao", "Tao, first copy", "a system of one's own"],
+    ids=["leapfrog", "composed, Legendre", "Tao", "Tao, first copy", "a system of one's own", "implicit midpoint"],
 )
 def test_points_side_by_side_go_where_each_goes_alone(system, integrator):
     """The propagator of many points in columns is that of each."""
