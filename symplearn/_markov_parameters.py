@@ -65,7 +65,9 @@ def impulse_response(
 ) -> MarkovParameters:
     """The first `lag` Markov parameters of the linear system (3.1): D, H B, H A B, ... (3.3)."""
     check_lag(lag)
-    return MarkovParameters(_response_blocks(_Matrices(*(jnp.asarray(matrix) for matrix in (A, B, H, D))), lag))
+    return MarkovParameters(
+        _response_blocks(_Matrices(*(jnp.asarray(matrix, dtype=float) for matrix in (A, B, H, D))), lag)
+    )
 
 
 @eqx.filter_jit
@@ -213,11 +215,11 @@ def _matrices(system: Any) -> _Matrices:
             "Markov parameters are of linear systems, `LinearDynamics` with `LinearObservation`, but were asked of "
             f"`{type(dynamics).__name__}` with `{type(observation).__name__}`."
         )
-    A, B, D = jnp.asarray(dynamics.A), dynamics.B, getattr(observation, "feedthrough", None)
+    A, B, D = jnp.asarray(dynamics.A, dtype=float), dynamics.B, getattr(observation, "feedthrough", None)
     H = observation.slope(jnp.zeros(A.shape[0]))
-    inputs = next((matrix.shape[1] for matrix in (B, D) if matrix is not None), 0)
-    B = jnp.zeros((A.shape[0], inputs)) if B is None else jnp.asarray(B)
-    return _Matrices(A, B, H, jnp.zeros((H.shape[0], inputs)) if D is None else jnp.asarray(D))
+    inputs = next((np.shape(matrix)[1] for matrix in (B, D) if matrix is not None), 0)
+    B = jnp.zeros((A.shape[0], inputs)) if B is None else jnp.asarray(B, dtype=float)
+    return _Matrices(A, B, H, jnp.zeros((H.shape[0], inputs)) if D is None else jnp.asarray(D, dtype=float))
 
 
 def check_lag(lag: int) -> None:

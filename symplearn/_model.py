@@ -22,6 +22,11 @@ from ._transforms import AbstractTransform, Images, Moments
 from ._triangular import semidefinite_cholesky
 
 
+def _floats(given: Any) -> Any:
+    """Bare numbers in the working precision: a filter's loop carries one kind of them."""
+    return given if given is None or isinstance(given, eqx.Module) else jnp.asarray(given, dtype=float)
+
+
 class Gaussian(AbstractKnown):
     """A normal distribution: `mean` of shape (d,) and `covariance` of shape (d, d), which may be singular.
 
@@ -30,8 +35,8 @@ class Gaussian(AbstractKnown):
     **Raises:** `InputError` where the covariance is not square, not symmetric, or not of the mean's length.
     """
 
-    mean: Any
-    covariance: Any
+    mean: Any = eqx.field(converter=_floats)
+    covariance: Any = eqx.field(converter=_floats)
 
     def __check_init__(self):
         refuse_asymmetric("Gaussian", "covariance", self.covariance)
@@ -116,10 +121,10 @@ class LinearDynamics(AbstractAffine):
         _refuse_rows("LinearDynamics", ("A", self.A), ("B", self.B))
 
     def slope(self, x: Float[Array, " state"]) -> Float[Array, "state state"]:
-        return jnp.asarray(self.A)
+        return jnp.asarray(self.A, dtype=float)
 
     def __call__(self, x: Float[Array, " state"], interval: Any = None) -> Float[Array, " state"]:
-        return product(jnp.asarray(self.A), x) + _driven(self.B, interval, x.shape[0], "LinearDynamics")
+        return product(self.slope(x), x) + _driven(self.B, interval, x.shape[0], "LinearDynamics")
 
 
 def _refuse_rows(owner: str, first: tuple[str, Any], second: tuple[str, Any]) -> None:
@@ -142,7 +147,7 @@ def _driven(matrix: Any, context: Any, size: int, owner: str) -> Array:
         raise InputError(
             f"`{owner}` has an input matrix, but the recording has no inputs; give `TimeSeries` its `inputs`."
         )
-    return product(jnp.asarray(matrix), given)
+    return product(jnp.asarray(matrix, dtype=float), given)
 
 
 class Propagator(eqx.Module):
@@ -241,10 +246,10 @@ class LinearObservation(AbstractAffine):
         _refuse_rows("LinearObservation", ("matrix", self.matrix), ("feedthrough", self.feedthrough))
 
     def slope(self, x: Float[Array, " state"]) -> Float[Array, "channel state"]:
-        return jnp.asarray(self.matrix)
+        return jnp.asarray(self.matrix, dtype=float)
 
     def __call__(self, x: Float[Array, " state"], context: Any = None) -> Float[Array, " channel"]:
-        reading = product(jnp.asarray(self.matrix), x)
+        reading = product(self.slope(x), x)
         return reading + _driven(self.feedthrough, context, reading.shape[0], "LinearObservation")
 
 

@@ -26,8 +26,8 @@ from ._suitability import refuse_unsuited, refuse_wrong_state
 from ._transforms import STANDARD, AbstractTransform, Moments, Taylor
 
 
-def _array_or_none(rows: Any) -> Array | None:
-    return None if rows is None else jnp.asarray(rows)
+def _floats(rows: Any) -> Any:
+    return None if rows is None else jnp.asarray(rows, dtype=float)
 
 
 class TimeSeries(eqx.Module):
@@ -38,9 +38,9 @@ class TimeSeries(eqx.Module):
     Wherever a recording is asked for, anything with these two attributes will do.
     """
 
-    times: Float[Array, " time"] = eqx.field(converter=jnp.asarray)
-    readings: Float[Array, "time channel"] = eqx.field(converter=jnp.asarray)
-    inputs: Float[Array, "time input"] | None = eqx.field(converter=_array_or_none, default=None)
+    times: Float[Array, " time"] = eqx.field(converter=_floats)
+    readings: Float[Array, "time channel"] = eqx.field(converter=_floats)
+    inputs: Float[Array, "time input"] | None = eqx.field(converter=_floats, default=None)
 
 
 def as_time_series(recording: Any) -> TimeSeries:

@@ -4,13 +4,25 @@ import equinox as eqx
 import estimation_cases as cases
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 
 import integrators as ig
 from symplearn._filter import log_likelihood, unscented_filter
-from symplearn._model import Coordinates, Gaussian, Propagator, StateSpaceModel, intervals_between
+from symplearn._markov_parameters import impulse_response
+from symplearn._model import (
+    Coordinates,
+    FullState,
+    Gaussian,
+    LinearDynamics,
+    LinearObservation,
+    Propagator,
+    StateSpaceModel,
+    intervals_between,
+)
 from symplearn._noise import AdditiveGaussian, Dense
+from symplearn._objectives import MARGINAL_LIKELIHOOD, TimeSeries
 from symplearn._transforms import UnscentedTransform
 from symplearn._triangular import semidefinite_cholesky
 
@@ -44,6 +56,32 @@ def test_linear_models_give_the_kalman_filter(alpha, tolerance, missing):
     assert float(SCORE(cases.as_model(*system), ys, SPANS, None, UnscentedTransform(alpha))) == pytest.approx(
         expected, rel=tolerance
     )
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.float32, float, list])
+def test_numbers_of_any_kind_are_numbers(kind, monkeypatch):
+    """Matrices, moments and readings in whole numbers, single precision or lists give the same likelihood, also where
+    the first reading stands for the start."""
+    # The tests' own check of annotations, which a user does not have, would speak first.
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    whole = [np.array([[0, 1], [-1, 0]]), np.eye(2, dtype=int), np.diag([2, 1]), np.eye(2, dtype=int)]
+    A, H, Q, R, m0, P0, ys = (
+        number.tolist() if kind is list else number.astype(kind)
+        for number in (*whole, np.array([1, -1]), np.eye(2, dtype=int), np.arange(12).reshape(6, 2) % 5)
+    )
+    noises = AdditiveGaussian(Dense(Q)), AdditiveGaussian(Dense(R))
+    series = TimeSeries(np.arange(6).tolist() if kind is list else np.arange(6).astype(kind), ys)
+    model = StateSpaceModel(LinearDynamics(A), LinearObservation(H), *noises, Gaussian(m0, P0))
+    expected = cases.kalman_log_likelihood(*map(np.asarray, (A, H, Q, R, m0, P0)), np.array(ys, float))[0]
+    assert -float(MARGINAL_LIKELIHOOD(model, series)) == pytest.approx(expected, rel=1e-12)
+    # Conditioned on the first reading: the same from a state known as well as it tells, but for its own increment.
+    begun = StateSpaceModel(LinearDynamics(A), FullState(), *noises)
+    later = np.array(ys, float)
+    later[0] = np.nan
+    expected = cases.kalman_log_likelihood(*map(np.asarray, (A, H, Q, R, ys[0], R)), later)[0]
+    assert -float(MARGINAL_LIKELIHOOD.score(begun, series)) == pytest.approx(expected, rel=1e-12)
+    responses = impulse_response(A, [[1], [0]], H, [[0], [0]], 3).blocks
+    np.testing.assert_array_equal(responses[..., 0], [[0, 0], [1, 0], [0, -1]])
 
 
 def test_a_row_wholly_missing_contributes_nothing():
