@@ -19,7 +19,11 @@ from ._distributions import MultivariateNormal as MultivariateNormal
 from ._distributions import StudentT as StudentT
 from ._distributions import Uniform as Uniform
 from ._doubled import DoubledPropagator as DoubledPropagator
+from ._doubled import IndependentDraws as IndependentDraws
+from ._doubled import SharedDraw as SharedDraw
 from ._doubled import doubled as doubled
+from ._doubled import doubled_observation as doubled_observation
+from ._doubled import doubled_transform as doubled_transform
 from ._dram import DRAM as DRAM
 from ._dram import blocks_of as blocks_of
 from ._dram_sweep import DRAMInfo as DRAMInfo
@@ -106,6 +110,7 @@ from ._parameters import Learnt as Learnt
 from ._parameters import Positive as Positive
 from ._parameters import PositiveDefinite as PositiveDefinite
 from ._parameters import resolve as resolve
+from ._particle_filter import ParticleFault as ParticleFault
 from ._particle_filter import ParticleFiltered as ParticleFiltered
 from ._particle_filter import SystematicResampling as SystematicResampling
 from ._particle_filter import particle_filter as particle_filter

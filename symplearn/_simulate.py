@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from ._doubled import DoubledNoise
 from ._errors import InputError
 from ._hidden_markov import HiddenMarkovModel
 from ._keys import refuse_key
@@ -15,6 +16,7 @@ from ._model import AbstractStateSpaceModel, Instant, Interval, StateSpaceModel,
 from ._noise import Additive, Multiplicative
 from ._objectives import TimeSeries
 from ._parameters import resolve
+from ._transforms import Moments
 from ._triangular import semidefinite_cholesky
 
 
@@ -126,6 +128,8 @@ def draw_noise(noise: Any, value: Float[Array, " entry"], record: Any, key: PRNG
         return product if noise.additive is None else draw_noise(noise.additive, product, record, key)
     if isinstance(noise, Additive):
         return value + same_size(sampled(noise.distribution, key), value, "additive noise")
+    if isinstance(noise, DoubledNoise) and not hasattr(noise.noise, "covariance"):
+        return value + _drawn_twice(noise, value, record, key)
     if not hasattr(noise, "covariance"):
         raise InputError(
             f"`{type(noise).__name__}` cannot be drawn: it has neither a distribution nor a `covariance(record)`; use "
@@ -133,6 +137,20 @@ def draw_noise(noise: Any, value: Float[Array, " entry"], record: Any, key: PRNG
         )
     root = semidefinite_cholesky(noise.covariance(record))
     return value + same_size(root @ jax.random.normal(key, root.shape[:1]), value, "additive noise")
+
+
+def _drawn_twice(noise: DoubledNoise, value: Array, record: Any, key: PRNGKeyArray) -> Array:
+    """A draw of a noise of the phase point for each column that `draws` makes of one: one for both copies, or two."""
+    nothing, no_columns = jnp.zeros(value.shape), jnp.zeros((value.shape[0], 0))
+    means = noise.enter(Moments(nothing, no_columns, no_columns), record).mean
+    of_one = value.shape[0] // 2
+
+    def part(column: int, key: PRNGKeyArray) -> Array:
+        draw = draw_noise(noise.noise, nothing[:of_one], record, key) - means[:of_one]
+        return noise.draws(draw[:, None])[:, column]
+
+    keys = jax.random.split(key, noise.draws(nothing[:of_one, None]).shape[1])
+    return means + sum((part(k, one) for k, one in enumerate(keys)), nothing)
 
 
 def own_parts(model: Any) -> StateSpaceModel:

@@ -11,13 +11,14 @@ import pytest
 import scipy.stats
 
 import integrators as ig
+from symplearn import ParticleFault
 from symplearn._distributions import DoubleExponential, MultivariateNormal, StudentT, Uniform
 from symplearn._errors import InputError
 from symplearn._filter import log_likelihood
 from symplearn._hidden_markov import HiddenMarkovModel
 from symplearn._model import Coordinates, FullState, Gaussian, Propagator, StateSpaceModel, intervals_between
 from symplearn._noise import AbstractNoise, Additive, AdditiveGaussian, Dense, Multiplicative, ScaledIdentity
-from symplearn._particle_filter import ParticleFault, SystematicResampling, particle_filter
+from symplearn._particle_filter import SystematicResampling, particle_filter
 
 N, REPEATS = 10, 200
 SPANS = intervals_between(jnp.arange(float(N)))

@@ -10,22 +10,26 @@ from estimation_cases import Conditioned, kalman_log_likelihood
 from scipy.integrate import solve_ivp
 
 import integrators as ig
-from symplearn._doubled import (
-    AffineDoubledObservation,
-    DoubledNoise,
-    DoubledObservation,
+
+# What `doubled` and its docstring speak of is public.
+from symplearn import (
     DoubledPropagator,
     IndependentDraws,
+    SharedDraw,
     doubled,
     doubled_observation,
     doubled_transform,
+    simulate,
 )
+from symplearn._distributions import Uniform
+from symplearn._doubled import AffineDoubledObservation, DoubledNoise, DoubledObservation
 from symplearn._errors import InputError
 from symplearn._filter import log_likelihood, unscented_filter
 from symplearn._model import Coordinates, FullState, Gaussian, Interval, Propagator, StateSpaceModel, intervals_between
 from symplearn._noise import Additive, AdditiveGaussian, Dense, Diagonal, Multiplicative, ScaledIdentity
 from symplearn._objectives import MarginalLikelihood, TimeSeries
 from symplearn._parameters import Learnt, flatten
+from symplearn._simulate import draw_noise
 from symplearn._smoother import smooth
 from symplearn._transforms import Taylor, UnscentedTransform
 
@@ -313,3 +317,22 @@ def test_a_composition_reads_as_its_base_and_several_recordings_keep_their_start
     twin = doubled(model)
     assert isinstance(twin.observation.projection, ig.FirstCopy)
     np.testing.assert_array_equal(twin.initial[1].covariance, np.kron(np.ones((2, 2)), np.eye(2)))
+
+
+@pytest.mark.parametrize("draws", [SharedDraw(), IndependentDraws()])
+def test_added_noise_of_any_distribution_is_drawn_in_both_copies(draws):
+    """Of a uniform process noise both copies have one draw, or each its own: bounds, mean and covariance, and a model
+    with it is simulated."""
+    lower, upper = jnp.array([-0.1, 0.0]), jnp.array([0.3, 0.2])
+    noise = Additive(Uniform(lower, upper))
+    keys = jax.random.split(jax.random.key(2), 10_000)
+    found = np.asarray(jax.vmap(lambda key: draw_noise(DoubledNoise(noise, draws), jnp.zeros(4), None, key))(keys))
+    assert np.all(found >= np.tile(lower, 2)) and np.all(found <= np.tile(upper, 2))
+    Q = np.diag((upper - lower) ** 2 / 12)
+    off = Q if isinstance(draws, SharedDraw) else 0 * Q
+    # Three standard errors: sd / 100 of a mean, and 1.4 % of the largest variance.
+    np.testing.assert_allclose(found.mean(axis=0), np.tile(0.5 * (lower + upper), 2), atol=3 * 0.12 / 100)
+    np.testing.assert_allclose(np.cov(found.T), np.block([[Q, off], [off, Q]]), atol=3 * 0.014 * Q.max())
+    plain = eqx.tree_at(lambda m: m.process_noise, _model(TAO, MEAN, 2), noise)
+    states = simulate(doubled(plain, draws=draws), TIMES, jax.random.key(3))[1]
+    assert states.shape == (len(TIMES), 4)
