@@ -68,7 +68,12 @@ def dram(
     """
     given = jnp.asarray(covariance, dtype=float)
     sweep = Sweep(log_density, checked_blocks(blocks, len(given)), patience, shrinkage)
-    return blackjax().base.SamplingAlgorithm(lambda position, rng_key=None: sweep.init(position, given), sweep.step)
+
+    def init(position: ArrayLike, rng_key: Any = None) -> DRAMState:
+        # On whole numbers a walk would be cut down to them.
+        return sweep.init(jnp.asarray(position, dtype=float), given)
+
+    return blackjax().base.SamplingAlgorithm(init, sweep.step)
 
 
 def checked_blocks(blocks: Sequence[Sequence[int]] | None, size: int) -> tuple[tuple[int, ...], ...]:

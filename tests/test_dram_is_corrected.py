@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 from blackjax.util import run_inference_algorithm
@@ -40,6 +41,18 @@ def test_blackjaxs_own_loop_runs_it(blocks):
         assert off_by(x[..., i], 0.0) < 3.0
         assert off_by(x[..., i] ** 2, 1.0) < 3.0
     assert off_by(x[..., 0] * x[..., 1], RHO) < 3.0
+
+
+def test_a_start_in_whole_numbers_is_a_start(monkeypatch):
+    """From whole numbers the chain is that from the same place in fractions, draw by draw."""
+    # The tests' own check of annotations, which a user does not have, would speak first.
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    ends = []
+    for begin in (jnp.array([1, -1]), jnp.array([1.0, -1.0])):
+        kernel = dram(correlated, np.eye(2), shrinkage=SHRINKAGE)
+        _, (states, _) = run_inference_algorithm(jax.random.key(0), kernel, 50, initial_position=begin)
+        ends.append(np.asarray(states.position))
+    np.testing.assert_array_equal(*ends)
 
 
 def test_infos_tell_the_stages():
