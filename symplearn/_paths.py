@@ -12,10 +12,10 @@ from ._errors import InputError
 from ._filter import unscented_filter
 from ._fit import Estimate
 from ._forecast_grid import Grid, grid_of, stepped, substeps_of
-from ._model import Instant, Interval
+from ._model import Instant, Interval, StateSpaceModel
 from ._objectives import MarginalLikelihood, TimeSeries, as_recordings, one_of, prepare
 from ._parameters import resolve
-from ._simulate import draw_noise, draw_reading, own_parts
+from ._simulate import draw_noise, draw_reading
 from ._smoother import smooth
 from ._transforms import AbstractTransform
 from ._triangular import semidefinite_cholesky
@@ -61,11 +61,17 @@ def task_of(
 ) -> Task:
     """The task of continuing one recording of an estimate.
 
-    **Raises:** `InputError` where there is no such recording, or times, inputs or substeps do not fit.
+    **Raises:** `InputError` where there is no such recording, the model is no `StateSpaceModel`, or times, inputs or
+    substeps do not fit.
     """
     several = as_recordings(estimate.recording)
     if not 0 <= recording < len(several):
         raise InputError(f"There are {len(several)} recordings, but number {recording} was asked for, counted from 0.")
+    if not isinstance(estimate.model, StateSpaceModel):
+        raise InputError(
+            f"Paths are drawn with noise and without it, so of a `StateSpaceModel`, but the model is "
+            f"`{type(estimate.model).__name__}`; use `forecast`, which needs its moments only."
+        )
     series = several[recording]
     grid = grid_of(estimate.model, series, times, until, choice.in_sample, inputs)
     objective = estimate.objective if isinstance(estimate.objective, MarginalLikelihood) else MarginalLikelihood()
@@ -95,7 +101,7 @@ def _path(task, model, key):
     def drawn(k, key):
         return means[k] + roots[k] @ jax.random.normal(key, means[k].shape) if choice.spread else means[k]
 
-    model = stepped(own_parts(model), task.substeps)
+    model = stepped(model, task.substeps)
 
     def step(x, data):
         interval, noisy, reading, key = data

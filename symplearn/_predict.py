@@ -152,7 +152,9 @@ def stochastic_forecast(
 
 
 def _checked(task: Task, estimate: Estimate, keys: Array, states: Array, readings: Array) -> PosteriorForecast:
-    limit = _ESCAPED * float(jnp.nanmax(jnp.abs(task.series.readings)))
+    largest = float(jnp.nanmax(jnp.abs(task.series.readings)))
+    # Where nothing but 0 was read there is no size to be far beyond.
+    limit = _ESCAPED * largest if largest > 0.0 else np.inf
     sound = np.all(np.isfinite(states), axis=2) & np.all(np.abs(np.asarray(readings)) <= limit, axis=2)
     alive = np.logical_and.accumulate(sound, axis=1)
     times = np.asarray(task.grid.times)[task.grid.wanted]

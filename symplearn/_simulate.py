@@ -42,12 +42,16 @@ def simulate(
 
 
 def _refuse_times(times: Array, inputs: Array | None) -> None:
-    if times.ndim != 1 or times.shape[0] < 2 or (inputs is not None and len(inputs) != len(times)):
+    if (
+        times.ndim != 1
+        or times.shape[0] < 2
+        or (inputs is not None and (inputs.ndim != 2 or len(inputs) != len(times)))
+    ):
         raise InputError(
             f"`simulate` needs at least two times (n,), and inputs (n, input) or None, but was given shapes "
             f"{times.shape} and {None if inputs is None else inputs.shape}."
         )
-    if not isinstance(times, jax.core.Tracer) and not np.all(np.diff(times) > 0):
+    if not isinstance(times, jax.core.Tracer) and not (np.all(np.isfinite(times)) and np.all(np.diff(times) > 0)):
         raise InputError("`simulate` needs finite times that strictly increase; sort them first.")
 
 

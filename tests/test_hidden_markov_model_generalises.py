@@ -12,10 +12,14 @@ import pytest
 from symplearn._distributions import Gamma, MultivariateNormal, Uniform
 from symplearn._errors import InputError
 from symplearn._filter import unscented_filter
+from symplearn._fit import Estimate
+from symplearn._forecast import forecast
 from symplearn._hidden_markov import HiddenMarkovModel
 from symplearn._model import Gaussian, LinearObservation, StateSpaceModel, intervals_between
 from symplearn._noise import Additive, AdditiveGaussian, Dense, Diagonal, Multiplicative, WienerIncrement
 from symplearn._objectives import MarginalLikelihood, TimeSeries
+from symplearn._predict import stochastic_forecast
+from symplearn._prior import Flat, Prior
 from symplearn._simulate import simulate
 from symplearn._smoother import smooth
 from symplearn._transforms import STANDARD, GaussHermite, UnscentedTransform
@@ -205,5 +209,23 @@ def test_what_cannot_be_drawn_is_refused():
         simulate(StateSpaceModel(model.dynamics, model.observation, *2 * [model.process_noise]), TIMES, key)
     with pytest.raises(InputError, match="not finite from t = 2"):
         simulate(cases.as_model(1e200 * system[0], *system[1:]), TIMES, key)
-    with pytest.raises(InputError, match="increase"):
-        simulate(model, TIMES[::-1], key)
+    for times in (TIMES[::-1], TIMES.at[-1].set(jnp.inf)):
+        with pytest.raises(InputError, match="finite times that strictly increase"):
+            simulate(model, times, key)
+    with pytest.raises(InputError, match=r"inputs \(n, input\) or None, but was given shapes \(12,\) and \(12,\)"):
+        simulate(model, TIMES, key, inputs=TIMES)
+
+
+def test_paths_of_the_general_form_are_refused_for_what_it_is():
+    """A general model's noise cannot be left out of a path: the sentence says so and names `forecast`, which serves."""
+    system = cases.linear_system()
+    model, ys = cases.as_model(*system), jnp.asarray(recorded(system))
+    ends = []
+    for one in (model, with_added_noise(model)):
+        estimate = Estimate(one, TimeSeries(TIMES, ys), MarginalLikelihood(), Prior(Flat()), *[0.0] * 4, True, 0)
+        ends.append(forecast(estimate, until=N + 2.0))
+    assert_same(ends[1], ends[0], atol=1e-11)  # sigma points of a linear map: round-off, and weights of some units
+    with pytest.raises(
+        InputError, match="of a `StateSpaceModel`, but the model is `HiddenMarkovModel`; use `forecast`"
+    ):
+        stochastic_forecast(estimate, until=N + 2.0, key=jax.random.key(0))

@@ -13,7 +13,7 @@ from symplearn._noise import AdditiveGaussian, Diagonal, ScaledIdentity, WienerI
 from symplearn._objectives import MarginalLikelihood, TimeSeries
 from symplearn._parameters import Frozen, Learnt
 from symplearn._posterior import posterior_of
-from symplearn._predict import posterior_forecast
+from symplearn._predict import posterior_forecast, stochastic_forecast
 from symplearn._prior import Flat, Prior
 from symplearn._sampler import Drawn
 
@@ -213,3 +213,12 @@ def test_diverged_draws_are_counted(swing):
     with pytest.raises(InputError, match="All 400 draws have diverged by t = "):
         escapes(1e4)
     assert "none diverged" in str(posterior_forecast(swing, times=FINE, draws=400, key=jax.random.key(7)))
+
+
+def test_a_recording_of_zeros_has_no_size():
+    """Where nothing but 0 was read no draw is too far beyond it: all are alive."""
+    linear, _ = linear_posterior()
+    model, still = linear.estimate.model, TimeSeries(np.arange(float(STEPS)), np.zeros((STEPS, 2)))
+    estimate = Estimate(model, still, MarginalLikelihood(), Prior(Flat()), *[0.0] * 4, True, 1)
+    ahead = stochastic_forecast(estimate, until=STEPS + 2.0, draws=20, key=jax.random.key(0))
+    assert not np.any(ahead.diverged)
