@@ -117,6 +117,8 @@ def unscented_filter(
     `passage` - one reading after the other, `Sequential`, or all side by side, `ParallelInTime`, for affine models.
 
     Works under `jit`, `vmap`, `jacfwd` and `grad`. A failure is a value: see `Filtered.fault`; derivatives are then 0.
+
+    **Raises:** `InputError` where the readings have other channels than the model's observation.
     """
     carry, records = passage.run(model, readings, intervals, contexts, transform, keep=True)
     # The fields of `Record` are those of `Filtered` between the first and the faults.
@@ -157,7 +159,8 @@ def kalman_filter(
 
     Arguments as for `unscented_filter`, which gives the same for such a model.
 
-    **Raises:** `InputError` where the dynamics or the observation is not an `AbstractAffine`.
+    **Raises:** `InputError` where the dynamics or the observation is not an `AbstractAffine`, or the readings have
+    other channels than the observation.
     """
     for name, part in (("dynamics", model.dynamics), ("observation", model.observation)):
         if not isinstance(part, AbstractAffine):

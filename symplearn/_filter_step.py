@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from ._errors import InputError
 from ._faults import IMPOSSIBLE, Fault, first_fault, is_fatal, is_remote
 from ._model import AbstractStateSpaceModel
 from ._small_products import product
@@ -80,8 +81,9 @@ def measure(model, transform, carry, predicted, reading, context, k):
     # An exact reading takes the prediction's wide factor as it is and spares a triangularisation.
     root = factor if model.reads_exactly else triangularise(factor)[0]
     mean, rows, source = model.read(transform, m, root, context)
-    seen = ~jnp.isnan(reading)
     channels = reading.shape[0]
+    _refuse_other_channels(channels, mean.shape[0])
+    seen = ~jnp.isnan(reading)
     masked = jnp.where(seen[:, None], rows, 0.0)
     triangle, good = triangularise(jnp.concatenate([masked, source]))
     S_root, G = triangle[:channels, :channels], triangle[channels:, :channels]
@@ -104,6 +106,15 @@ def measure(model, transform, carry, predicted, reading, context, k):
     moments = after.mean, product(after.root, after.root.T)
     record = Record(if_ok, m, product(factor, factor.T), *moments, r, product(rows, rows.T), e, seen)
     return after, jax.tree.map(_tidy, record)
+
+
+def _refuse_other_channels(read: int, predicted: int) -> None:
+    # One number would be stretched over all channels without a word.
+    if read != predicted:
+        raise InputError(
+            f"The readings have {read} channels, but the model's observation gives {predicted}; read the channels that "
+            "were recorded."
+        )
 
 
 def _tidy(leaf: Array) -> Array:

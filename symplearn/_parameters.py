@@ -86,7 +86,7 @@ class Positive(AbstractParameter):
 class Bounded(AbstractParameter):
     """A number or array that learns between `lower` and `upper`, through its logit; it starts at `value`.
 
-    **Raises:** `InputError` where an entry is not strictly between the bounds.
+    **Raises:** `InputError` where a bound is not finite or an entry not strictly between the bounds.
     """
 
     free: Array
@@ -95,6 +95,10 @@ class Bounded(AbstractParameter):
 
     def __init__(self, value: Any, lower: Any, upper: Any):
         value, lower, upper = (jnp.asarray(number, dtype=float) for number in (value, lower, upper))
+        require(
+            jnp.isfinite(lower) & jnp.isfinite(upper),
+            "`Bounded` needs finite bounds, but one is infinite or no number; use `Positive` for a bound at 0 alone.",
+        )
         require(
             (lower < value) & (value < upper),
             "`Bounded` needs lower < value < upper, but its value lies on or outside a bound.",

@@ -33,6 +33,12 @@ def model(dynamics=None, observation=None, noise=None, mean=None, covariance=Non
     )
 
 
+def two_read(dynamics=None):
+    """The linear model with both numbers read."""
+    both = sl.AdditiveGaussian(sl.ScaledIdentity(0.1, dim=2))
+    return eqx.tree_at(lambda m: m.measurement_noise, model(dynamics, sl.FullState()), both)
+
+
 def noise(structure):
     """Process noise of that structure."""
     return sl.AdditiveGaussian(structure)
@@ -110,6 +116,8 @@ ODD = {
     "variance of rates": (lambda: sl.HamiltonianLeastSquares(-1.0), "positive variances"),
     "variance of gaps": (lambda: sl.GaussianContinuity(-1.0), "positive variances"),
     "rate that is none": (lambda: sl.Adam(np.nan), "positive learning rate"),
+    "a bound at infinity": (lambda: sl.Bounded(1.0, 0.0, np.inf), "needs finite bounds"),
+    "a bound that is none": (lambda: sl.Bounded(1.0, np.nan, 2.0), "needs finite bounds"),
     "mean that is none": (lambda: sl.Normal(np.nan), "finite mean"),
 }
 
@@ -244,6 +252,14 @@ RECORDED = {
         lambda: sl.fit(model(sl.LinearDynamics(sl.Learnt(A)), sl.FullState()), PUSHED, prior=sl.Flat()),
         "has inputs, which `LinearDynamics` .* would ignore",
     ),
+    "readings of one channel more": (
+        lambda: sl.kalman_filter(model(), np.ones((5, 2)), sl.intervals_between(np.arange(5.0))),
+        "readings have 2 channels, but .* observation gives 1",
+    ),
+    "of one channel less": (
+        lambda: sl.unscented_filter(two_read(), np.ones((5, 1)), sl.intervals_between(np.arange(5.0))),
+        "readings have 1 channels, but .* observation gives 2",
+    ),
     "several starts": (lambda: sl.MarginalLikelihood().filter(STARTS, RECORDING), "has 2 initial distributions"),
 }
 
@@ -287,12 +303,6 @@ def test_inputs_that_may_be_known_are_let_through(dynamics):
     times = np.array([0.0, 0.033, 0.067, 0.1, 0.133])  # thirty rows a second, in milliseconds
     pushed = sl.TimeSeries(times, np.ones((5, 2)), np.ones((5, 1)))
     assert bool(sl.MarginalLikelihood().filter(two_read(dynamics), pushed).ok)
-
-
-def two_read(dynamics):
-    """The linear model with both numbers read."""
-    both = sl.AdditiveGaussian(sl.ScaledIdentity(0.1, dim=2))
-    return eqx.tree_at(lambda m: m.measurement_noise, model(dynamics, sl.FullState()), both)
 
 
 def test_strengths_of_binding_are_numbers():
