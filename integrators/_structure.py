@@ -65,10 +65,11 @@ class EnergyDrift(eqx.Module):
 
 
 def energy_drift(trajectory: Trajectory) -> EnergyDrift:
-    """The energy error of a trajectory, bounded or secular. NaN throughout where the trajectory diverged."""
+    """The energy error of a trajectory, bounded or secular; of one point, none. NaN throughout where it diverged."""
     ts, error = trajectory.ts, trajectory.energies - trajectory.energies[0]
     centred = ts - ts.mean()
-    slope = centred @ error / (centred @ centred)
+    spread = centred @ centred
+    slope = centred @ error / jnp.where(spread > 0.0, spread, 1.0)
     drift = EnergyDrift(jnp.abs(error).max(), slope, jnp.abs(slope * (ts[-1] - ts[0])))
     return jax.tree.map(lambda number: jnp.where(trajectory.finite, number, jnp.nan), drift)
 

@@ -123,10 +123,12 @@ def test_too_weak_a_binding_parts_the_copies():
 
 
 def test_a_drift_is_measured_as_one():
-    """energy_drift returns the slope of a straight line and NaN for a diverged trajectory."""
+    """energy_drift returns the slope of a straight line, none of a single point and NaN for a diverged trajectory."""
     ts = jnp.array([0.0, 1.0, 3.0, 4.0])
     line = ig.Trajectory(ts, jnp.zeros((4, 2)), 2.0 + 0.5 * ts, jnp.array(True), jnp.array(jnp.inf))
     drift = ig.energy_drift(line)
     assert (drift.largest, drift.slope, drift.secular) == pytest.approx((2.0, 0.5, 2.0), abs=1e-14)
+    point = ig.energy_drift(ig.integrate(ig.problems.Pendulum(), ig.Leapfrog(), jnp.array([1.0, 0.0]), [2.0]))
+    assert (point.largest, point.slope, point.secular) == (0.0, 0.0, 0.0)
     broken = ig.Trajectory(ts, jnp.zeros((4, 2)), 2.0 + 0.5 * ts, jnp.array(False), jnp.array(3.0))
     assert np.isnan(ig.energy_drift(broken).largest)
