@@ -113,11 +113,13 @@ def advance(
     t1: Time,
     substeps: int = 1,
 ) -> Float[Array, "n ..."]:
-    """The integrator's own state after `substeps` equal steps from `t0` to `t1`. Not jitted.
+    """The integrator's own state after `substeps` equal steps from `t0` to `t1`, in the working precision. Not jitted.
 
     **Raises:** `ValueError` where `substeps` is no whole number from 1 up.
     """
     _refuse_count(substeps)
+    # As `integrate`: parameters and times are of that precision, and a loop's state keeps one.
+    state = jnp.asarray(state, dtype=float)
     return integrator.march(system.prepared(), state, t0, (t1 - t0) / substeps, substeps)
 
 

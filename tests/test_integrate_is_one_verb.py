@@ -72,6 +72,18 @@ def test_forward_and_reverse_derivatives_agree_with_finite_differences(name):
     np.testing.assert_allclose(jax.jit(jax.jacfwd(end))(theta), differences, atol=1e-8)
 
 
+@pytest.mark.parametrize("dtype", [np.int64, np.float32])
+@pytest.mark.parametrize("name", ["leapfrog", "suzuki4", "tao", "rk4", "implicit-midpoint", "blanes-moan"])
+def test_a_state_of_any_kind_of_numbers_is_stepped(name, dtype, unchecked):
+    """From whole numbers, or in single precision, the phase point at the end is that from the same numbers in the
+    working precision."""
+    method = ig.BlanesMoan4() if name == "blanes-moan" else METHODS[name]
+    ends = [
+        ig.propagate(ig.problems.Pendulum(), method, np.array([1, 0], kind), 0.0, 1.0, 3) for kind in (dtype, float)
+    ]
+    np.testing.assert_array_equal(*ends)
+
+
 def test_a_batch_is_a_vmap():
     """`vmap` over starts gives the same trajectories as one at a time."""
     system, starts = ig.problems.Pendulum(), jnp.array([[0.5, 0.0], [1.0, 0.2]])
