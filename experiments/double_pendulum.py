@@ -28,6 +28,7 @@ from scipy.integrate import solve_ivp
 
 import integrators as ig
 from symplearn._distributions import Uniform
+from symplearn._errors import InputError
 from symplearn._hamiltonian_objectives import MiniBatch, OneStepL1
 from symplearn._model import FullState, Gaussian, Interval, Propagator, StateSpaceModel
 from symplearn._neural_hamiltonian import NSSNN
@@ -74,6 +75,13 @@ class InPieces(AbstractObjective):
 
     length: int = eqx.field(static=True)
     batch: MiniBatch | None
+
+    def __check_init__(self) -> None:
+        if self.batch is not None and self.batch.size < self.length:
+            raise InputError(
+                f"A batch of {self.batch.size} data intervals holds no piece of {self.length}; make it larger, or the "
+                "pieces shorter."
+            )
 
     def score(self, model: StateSpaceModel, series: TimeSeries) -> Array:
         starts = self.length * np.arange((len(series.times) - 1) // self.length)

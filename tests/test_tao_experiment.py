@@ -5,10 +5,13 @@ import json
 import sys
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
 from command_line_cases import ROOT
 
+from symplearn._errors import InputError
+from symplearn._hamiltonian_objectives import MiniBatch
 from symplearn._objectives import TimeSeries
 
 sys.path.insert(0, str(ROOT))  # experiments are no installed package
@@ -121,6 +124,12 @@ def test_double_pendulum_truth_keeps_its_energy():
         H = judged.energy(pendulum.orbit(start, 501))
         assert H[0] == pytest.approx(energy, abs=5e-3)
         assert np.abs(H - H[0]).max() < 1e-8  # DOP853 at 1e-12 over 5 s
+
+
+def test_a_batch_holds_a_piece():
+    """A batch of fewer data intervals than a piece has is refused: its score was a division by zero."""
+    with pytest.raises(InputError, match="batch of 4 data intervals holds no piece of 5"):
+        pendulum.InPieces(5, MiniBatch(4, jax.random.key(0)))
 
 
 def test_double_pendulum_is_judged_as_defined():
