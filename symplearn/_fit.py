@@ -95,8 +95,8 @@ def fit(
     Under a `Laplace` prior coefficients may end at exactly 0.
 
     **Raises:** `InputError` where nothing learns, a leaf has no prior, the start has no finite score, a polynomial has
-    more terms than there are readings, the time step changes under process noise that is per data interval, or more
-    than 1500 numbers learn.
+    more terms than there are readings, the time step changes under process noise or `LinearDynamics`, which are per
+    data interval, nothing in the model takes the recording's inputs, or more than 1500 numbers learn.
     """
     refuse_count("fit", "max_steps", max_steps)
     prior = prior if isinstance(prior, Prior) else Prior(prior)

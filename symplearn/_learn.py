@@ -62,8 +62,9 @@ def learn(
     **Arguments:** as for `fit`; `recordings` - one, or a list.
 
     **Raises:** `InputError` where nothing learns, a leaf has no prior, every start is impossible, a polynomial has more
-    terms than there are readings or not the dimension of the state, the time step changes under process noise that is
-    per data interval, or more than 1500 numbers learn.
+    terms than there are readings or not the dimension of the state, the time step changes under process noise or
+    `LinearDynamics`, which are per data interval, nothing in the model takes the recording's inputs, or more than 1500
+    numbers learn.
     """
     prior = prior if isinstance(prior, Prior) else Prior(prior)
     several = as_recordings(recordings)
