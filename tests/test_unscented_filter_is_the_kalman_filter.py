@@ -72,13 +72,13 @@ def test_numbers_of_any_kind_are_numbers(kind, monkeypatch):
     noises = AdditiveGaussian(Dense(Q)), AdditiveGaussian(Dense(R))
     series = TimeSeries(np.arange(6).tolist() if kind is list else np.arange(6).astype(kind), ys)
     model = StateSpaceModel(LinearDynamics(A), LinearObservation(H), *noises, Gaussian(m0, P0))
-    expected = cases.kalman_log_likelihood(*map(np.asarray, (A, H, Q, R, m0, P0)), np.array(ys, float))[0]
+    exact = [np.array(number, float) for number in (A, H, Q, R, m0, P0, ys)]
+    expected = cases.kalman_log_likelihood(*exact)[0]
     assert -float(MARGINAL_LIKELIHOOD(model, series)) == pytest.approx(expected, rel=1e-12)
     # Conditioned on the first reading: the same from a state known as well as it tells, but for its own increment.
     begun = StateSpaceModel(LinearDynamics(A), FullState(), *noises)
-    later = np.array(ys, float)
-    later[0] = np.nan
-    expected = cases.kalman_log_likelihood(*map(np.asarray, (A, H, Q, R, ys[0], R)), later)[0]
+    later = np.where(np.arange(6)[:, None] == 0, np.nan, exact[6])
+    expected = cases.kalman_log_likelihood(*exact[:4], exact[6][0], exact[3], later)[0]
     assert -float(MARGINAL_LIKELIHOOD.score(begun, series)) == pytest.approx(expected, rel=1e-12)
     responses = impulse_response(A, [[1], [0]], H, [[0], [0]], 3).blocks
     np.testing.assert_array_equal(responses[..., 0], [[0, 0], [1, 0], [0, -1]])
