@@ -308,6 +308,8 @@ def test_what_is_not_used_of_a_file_is_told():
     term = 'effect = "sensor_noise"\ntarget = "X"\n'
     file = parse_simulation(f"{text}{term}s = {{ value = 1.0, sd = 0.2 }}", "known.toml")
     limits, noise = unused(file)
+    share = 'effect = "sensor_outliers"\ntarget = "Y"\ne = { value = 0.05, sd = 0.01 }\nsd = 2.0'
+    assert unused(parse_simulation(FILE + share, "known.toml"))[0].startswith("the outliers of Y are taken out")
     assert limits.startswith("[initial] x has limits") and noise.startswith("the noise of X is estimated")
     assert unused(parse_simulation(f"{text}{term}s = 3.0".replace(", lower = 0.5", ""), "known.toml")) == []
     run = Recording(1, "1", ("X", "Y"), TIMES, np.zeros((len(TIMES), 2)), np.arange(len(TIMES)))

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .._effects import NOISE
+from .._effects import NOISE, OUTLIERS
 from .._recording import Recording
 from .._simulation_records import SimulationFile
 from ._found import Found
@@ -192,13 +192,16 @@ def idle_units(file: SimulationFile) -> list[str]:
 
 
 def unused(file: SimulationFile) -> list[str]:
-    """What the file says and nothing uses: limits of a start, and what is known of a calibrated noise."""
+    """What the file says and nothing uses: limits of a start, and what is known of a calibrated scatter."""
     starts = [name for name, q in file.initial.items() if q.positive or q.lower is not None or q.upper is not None]
-    noises = [term.target[0] for term in file.terms if term.effect == NOISE.name and not term.coefficients["s"].known]
+    open_ = [term for term in file.terms if not all(q.known for q in term.coefficients.values())]
+    noises, outliers = ([t.target[0] for t in open_ if t.effect == one.name] for one in (NOISE, OUTLIERS))
     return [
         *(f"[initial] {name} has limits, which are not kept: a start is known by its value and sd" for name in starts),
         *(f"the noise of {column} is estimated, as if nothing were known of its factor in [[terms]]; give a number to "
           "have it kept" for column in noises),
+        *(f"the outliers of {column} are taken out as if nothing were known of their share and size in [[terms]]"
+          for column in outliers),
     ]  # fmt: skip
 
 
