@@ -17,14 +17,10 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ._errors import InputError
 from ._noise import AbstractCovariance, Diagonal, StandardDeviation
-from ._parameters import AbstractKnown, AbstractParameter, resolve
+from ._parameters import AbstractKnown, number, resolve
 from ._triangular import forward_substitution, semidefinite_cholesky
 
 _LOG_2PI = math.log(2 * math.pi)
-
-
-def _number(value: Any) -> Any:
-    return value if isinstance(value, AbstractKnown | AbstractParameter) else jnp.asarray(value, dtype=float)
 
 
 def _require(holds: Any, sentence: str) -> None:
@@ -78,7 +74,7 @@ class MultivariateNormal(AbstractDistribution):
     **Raises:** `InputError` where the mean is not a vector of the covariance's size.
     """
 
-    location: Any = eqx.field(converter=_number)
+    location: Any = eqx.field(converter=number)
     covariance: Any
 
     def __check_init__(self):
@@ -139,8 +135,8 @@ class Uniform(AbstractIndependent):
     **Raises:** `InputError` where upper <= lower.
     """
 
-    lower: Any = eqx.field(converter=_number)
-    upper: Any = eqx.field(converter=_number)
+    lower: Any = eqx.field(converter=number)
+    upper: Any = eqx.field(converter=number)
     dim: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
@@ -176,8 +172,8 @@ class DoubleExponential(AbstractIndependent):
     **Raises:** `InputError` where a scale is not positive.
     """
 
-    scale: Any = eqx.field(converter=_number)
-    location: Any = eqx.field(converter=_number, default=0.0)
+    scale: Any = eqx.field(converter=number)
+    location: Any = eqx.field(converter=number, default=0.0)
     dim: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
@@ -212,9 +208,9 @@ class StudentT(AbstractIndependent):
     **Raises:** `InputError` where a scale is not positive or a dof not above 2.
     """
 
-    scale: Any = eqx.field(converter=_number)
-    dof: Any = eqx.field(converter=_number)
-    location: Any = eqx.field(converter=_number, default=0.0)
+    scale: Any = eqx.field(converter=number)
+    dof: Any = eqx.field(converter=number)
+    location: Any = eqx.field(converter=number, default=0.0)
     dim: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
@@ -252,8 +248,8 @@ class Gamma(AbstractIndependent):
     **Raises:** `InputError` where a shape or a scale is not positive.
     """
 
-    shape: Any = eqx.field(converter=_number)
-    scale: Any = eqx.field(converter=_number)
+    shape: Any = eqx.field(converter=number)
+    scale: Any = eqx.field(converter=number)
     dim: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
@@ -292,8 +288,8 @@ class LogNormal(AbstractIndependent):
     **Raises:** `InputError` where a log_sd is not positive.
     """
 
-    log_mean: Any = eqx.field(converter=_number)
-    log_sd: Any = eqx.field(converter=_number)
+    log_mean: Any = eqx.field(converter=number)
+    log_sd: Any = eqx.field(converter=number)
     dim: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):

@@ -223,6 +223,8 @@ ON_PARAMETERS = (ERROR, DRIFTING, REGIME, MODULATION)
 ON_COLUMNS = (NOISE, BIAS, GAIN, DRIFT, DELAY, OUTLIERS)
 EFFECTS: dict[str, Effect] = {e.name: e for e in (*ON_COORDINATES, *ON_PAIRS, *ON_PARAMETERS, *ON_COLUMNS)}
 SIDES = ("upper", "lower")
+# What happens at one time.
+AT_ONCE = (IMPULSE, REGIME)
 
 
 def takes_back(effect: Effect, coefficients: Mapping[str, Any]) -> bool:

@@ -18,7 +18,7 @@ from ._guard import guard
 from ._model import Coordinates, FullState, LinearDynamics, LinearObservation, StateSpaceModel, intervals_between
 from ._objectives import TimeSeries, as_recordings, one_of
 from ._parameters import resolve
-from ._suitability import UNEVEN
+from ._suitability import is_uneven
 
 _LINEAR = LinearObservation | FullState | Coordinates
 
@@ -231,8 +231,7 @@ def check_spacing(series: TimeSeries) -> None:
     if isinstance(series.times, jax.core.Tracer):
         return
     spans = np.diff(np.asarray(series.times))
-    usual = np.median(spans)
-    if np.max(np.abs(spans - usual)) > UNEVEN * usual:
+    if is_uneven(spans):
         raise InputError(
             f"Markov parameters need evenly spaced rows, but the recording's intervals run from {spans.min():.4g} to "
             f"{spans.max():.4g}; put rows with NaN readings where some were left out, or resample."

@@ -16,15 +16,10 @@ from ._counts import refuse_count
 from ._errors import InputError
 from ._model_checks import length_of, refuse_asymmetric, refuse_matrix, refuse_misfit, shape_of
 from ._noise import AdditiveGaussian, WienerIncrement, enter
-from ._parameters import AbstractKnown
+from ._parameters import AbstractKnown, number
 from ._small_products import product
 from ._transforms import AbstractTransform, Images, Moments
 from ._triangular import semidefinite_cholesky
-
-
-def _floats(given: Any) -> Any:
-    """Bare numbers in the working precision: a filter's loop carries one kind of them."""
-    return given if given is None or isinstance(given, eqx.Module) else jnp.asarray(given, dtype=float)
 
 
 class Gaussian(AbstractKnown):
@@ -35,8 +30,8 @@ class Gaussian(AbstractKnown):
     **Raises:** `InputError` where the covariance is not square, not symmetric, or not of the mean's length.
     """
 
-    mean: Any = eqx.field(converter=_floats)
-    covariance: Any = eqx.field(converter=_floats)
+    mean: Any = eqx.field(converter=number)
+    covariance: Any = eqx.field(converter=number)
 
     def __check_init__(self):
         refuse_asymmetric("Gaussian", "covariance", self.covariance)

@@ -14,14 +14,10 @@ from jaxtyping import Array, Float
 from ._counts import refuse_count
 from ._errors import InputError
 from ._model_checks import length_of, refuse_asymmetric, shape_of
-from ._parameters import AbstractKnown, AbstractParameter
+from ._parameters import AbstractKnown, number
 from ._small_products import product
 from ._transforms import Moments, with_noise
 from ._triangular import semidefinite_cholesky
-
-
-def _number(value: Any) -> Any:
-    return value if isinstance(value, AbstractKnown | AbstractParameter) else jnp.asarray(value, dtype=float)
 
 
 def _root(number: Any) -> Array:
@@ -36,7 +32,7 @@ class StandardDeviation(AbstractKnown):
     A prior is then over the standard deviation.
     """
 
-    sd: Any = eqx.field(converter=_number)
+    sd: Any = eqx.field(converter=number)
 
 
 class LogVariance(AbstractKnown):
@@ -45,7 +41,7 @@ class LogVariance(AbstractKnown):
     A prior is then over the logarithm.
     """
 
-    log_variance: Any = eqx.field(converter=_number)
+    log_variance: Any = eqx.field(converter=number)
 
 
 def _variance(number: Any) -> Array:
@@ -91,7 +87,7 @@ class ScaledIdentity(AbstractCovariance):
     **Raises:** `InputError` where `dim` is no whole number of at least 1.
     """
 
-    variance: Any = eqx.field(converter=_number)
+    variance: Any = eqx.field(converter=number)
     dim: int = eqx.field(static=True)
 
     def __check_init__(self):
@@ -116,7 +112,7 @@ class Diagonal(AbstractCovariance):
     **Raises:** `InputError` where the variances are no vector.
     """
 
-    variances: Any = eqx.field(converter=_number)
+    variances: Any = eqx.field(converter=number)
 
     def __check_init__(self):
         if _shape_of(self.variances) == ():
@@ -142,7 +138,7 @@ class Dense(AbstractCovariance):
     **Raises:** `InputError` where it is not square or not symmetric.
     """
 
-    covariance: Any = eqx.field(converter=_number)
+    covariance: Any = eqx.field(converter=number)
 
     def __check_init__(self):
         refuse_asymmetric("Dense", "covariance", self.covariance)
@@ -169,8 +165,8 @@ class Correlated(AbstractCovariance):
     **Raises:** `InputError` where the correlation is not square or not symmetric.
     """
 
-    variances: Any = eqx.field(converter=_number)
-    correlation: Any = eqx.field(converter=_number)
+    variances: Any = eqx.field(converter=number)
+    correlation: Any = eqx.field(converter=number)
 
     def __check_init__(self):
         refuse_asymmetric("Correlated", "correlation", self.correlation)

@@ -36,6 +36,11 @@ class AbstractKnown(eqx.Module):
     """A record whose bare numbers are known: only the parameters put into it, as `Positive`, learn."""
 
 
+def number(value: Any) -> Any:
+    """A bare number or array in the working precision, which loops carry; what learns or is said to be known stays."""
+    return value if isinstance(value, AbstractKnown | AbstractParameter) else jnp.asarray(value, dtype=float)
+
+
 def require(holds: Any, sentence: str) -> None:
     """Refuse concrete bad values; inside a transformation there is nothing to look at."""
     if not isinstance(holds, jax.core.Tracer) and not np.all(holds):

@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 import integrators as ig
 
@@ -12,7 +13,7 @@ from ._model import Coordinates, FullState, LinearDynamics, LinearObservation, P
 from ._noise import Additive, AdditiveGaussian, Multiplicative, WienerIncrement
 
 # Rounded time stamps are uneven by less than this share of the spacing; a row that is left out by far more.
-UNEVEN = 0.05
+_UNEVEN = 0.05
 _WITHOUT_RECORD = FullState | Coordinates | AdditiveGaussian | WienerIncrement | Additive
 
 
@@ -36,12 +37,17 @@ def _refuse_uneven(model: Any, recordings: tuple[Any, ...]) -> None:
     if not isinstance(getattr(model, "dynamics", None), LinearDynamics) or not is_known:
         return
     spans = np.concatenate([np.diff(np.asarray(series.times)) for series in recordings])
-    usual = np.median(spans)
-    if np.max(np.abs(spans - usual)) > UNEVEN * usual:
+    if is_uneven(spans):
         raise InputError(
             f"A is per data interval, so all intervals must be equal, but they last from {spans.min():.6g} to "
             f"{spans.max():.6g}; give rows of NaN where readings are missing, or dynamics that take the interval."
         )
+
+
+def is_uneven(spans: Float[np.ndarray, " interval"]) -> bool:
+    """Whether data intervals differ by more than rounded time stamps do."""
+    usual = np.median(spans)
+    return bool(np.max(np.abs(spans - usual)) > _UNEVEN * usual)
 
 
 def _ignores_inputs(part: Any) -> bool:

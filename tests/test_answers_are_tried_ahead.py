@@ -117,10 +117,10 @@ def test_a_column_that_begins_late_has_no_part_in_what_holds(unit):
     z[0, 0] = 0.99
     (inside, before), (ahead, after) = _squares(Stepper(p), z, [()], ROWS, first)
     assert before.tolist() == [True, False] and after.tolist() == [True, True]
-    # Half the square of what the start is off by: a swing's mean square.
-    assert inside[0, 0] == pytest.approx(0.01**2 / 2, rel=0.1) and ahead[0, 1] == pytest.approx(
-        inside[0, 0] * unit**2, rel=0.1
-    )
+    # Half the square of what the start is off by, a swing's mean square, but for the part of a swing that is no whole
+    # one: of x radians at most 1 / 2x, a twentieth of the last twelve. Held to twice that. Seen: 0.012 and 0.049.
+    assert inside[0, 0] == pytest.approx(0.01**2 / 2, rel=0.1)
+    assert ahead[0, 1] == pytest.approx(inside[0, 0] * unit**2, rel=0.1)
 
 
 def test_white_noise_needs_no_second_look():

@@ -85,9 +85,9 @@ def test_rows_that_average_many_readings_owe_no_more():
     errors = (readings - np.cos(TIMES))[:, None] / NOISE
     for count in (1.0, 20.0, 400.0):
         many = replace(p, rows=(replace(p.rows[0], counts=count * p.rows[0].counts),))
-        weight = weights(many, [len(TIMES)])[0][0, 0]
+        (weight,) = weights(many, [len(TIMES)])
         w = Weigher(Stepper(many), Found(many, priors_without_effects(many)))
-        found.append(w._owed((member,), errors, out, np.full(1, NOISE * np.sqrt(weight))))
+        found.append(w._owed((member,), errors, out, np.full(1, NOISE * np.sqrt(weight[0, 0])), weight))
     np.testing.assert_allclose(found, found[0], rtol=1e-12)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .._effects import IMPULSE, REGIME
+from .._effects import AT_ONCE
 from ._calibrate import calibrate, residuals, weights
 from ._found import Ahead, Found
 from ._problem import Combination, Problem
@@ -72,7 +72,7 @@ def _scores(
 
 def _before_it(problem: Problem, combination: Combination) -> Combination:
     """A combination without what happens at one time."""
-    return tuple(m for m in combination if problem.candidate(m).effect not in (IMPULSE, REGIME))
+    return tuple(m for m in combination if problem.candidate(m).effect not in AT_ONCE)
 
 
 def _known(problem: Problem, combination: Combination, combinations: list[Combination]) -> int:
@@ -84,7 +84,7 @@ def _known(problem: Problem, combination: Combination, combinations: list[Combin
 def _is_later(problem: Problem, z: np.ndarray, combination: Combination, first: Sequence[int]) -> bool:
     """Whether something of a combination happens at one time, and the first rows end before it or soon after."""
     for m, place in problem.placed(combination):
-        if problem.candidate(m).effect in (IMPULSE, REGIME):
+        if problem.candidate(m).effect in AT_ONCE:
             seen = [problem.rows[r].times[round(_KNOWN * (first[r] - 1))] for r in problem.members[m].recordings]
             if z[place.stop - 1] > min(seen):
                 return True

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .._effects import IMPULSE, REGIME, Candidate
+from .._effects import AT_ONCE, Candidate
 from ._problem import Combination, Problem
 from ._trajectory import Predictions, Stepper
 
@@ -83,7 +83,7 @@ class Priors:
 
     def when(self, problem: Problem, member: int) -> tuple[float, float] | None:
         """From when to when the recordings are read that have a member which comes at once; `None` of any other."""
-        if self.windows is None or problem.candidate(member).effect not in (IMPULSE, REGIME):
+        if self.windows is None or problem.candidate(member).effect not in AT_ONCE:
             return None
         mine = self.windows[list(problem.members[member].recordings)]
         return float(mine[:, 0].min()), float(mine[:, 1].max())
@@ -121,9 +121,13 @@ def weights(problem: Problem, rows: Sequence[int]) -> list[Float[np.ndarray, "_ 
     """Readings averaged in every row, in units of one reading's information; 0 where there is none."""
     out = []
     for r, n in zip(problem.rows, rows, strict=True):
-        counts = r.counts[:n]
-        out.append(np.where(counts > 1, counts / THINNED, counts))
+        out.append(weight_of(r.counts[:n]))
     return out
+
+
+def weight_of(counts: Float[np.ndarray, "_ channel"]) -> Float[np.ndarray, "_ channel"]:
+    """The same of rows that average so many readings each."""
+    return np.where(counts > 1, counts / THINNED, counts)
 
 
 def residuals(problem: Problem, predictions: list[Predictions], weight: list[np.ndarray]) -> list[np.ndarray]:

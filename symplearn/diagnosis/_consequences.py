@@ -135,7 +135,7 @@ def _swings(said: Said) -> str:
 
 
 def _creeps(said: Said) -> str:
-    way = said.by_sign("r", "grows", "shrinks")  # which a negative value does by a change of either sign, too
+    way = said.by_sign("r", "grows", "shrinks")  # in size: the value itself may be negative
     return f"It {way} by {said.percent('r')} {said.per_time('r')} of its value at the first row."
 
 

@@ -42,7 +42,7 @@ def grid(problem: Problem, priors: Priors, candidate: int) -> list[Unit]:
 
 def _tried(problem: Problem, priors: Priors, one: Candidate) -> np.ndarray:
     low, high = ends(priors, one)
-    if priors.windows is None or one.effect not in (effects.IMPULSE, effects.REGIME):
+    if priors.windows is None or one.effect not in effects.AT_ONCE:
         return _places(one, low, high, max(float(np.ptp(r.times)) for r in problem.rows))
     # Where clocks lie apart, time between them is none.
     begins, read = _joined(priors.windows)
@@ -54,7 +54,7 @@ def _tried(problem: Problem, priors: Priors, one: Candidate) -> np.ndarray:
 
 def ends(priors: Priors, one: Candidate) -> tuple[float, float]:
     """Between which values the place of an effect lies: of what comes at once, from zero to how long is read in all."""
-    if priors.windows is not None and one.effect in (effects.IMPULSE, effects.REGIME):
+    if priors.windows is not None and one.effect in effects.AT_ONCE:
         return 0.0, float(_joined(priors.windows)[1].sum())
     return float(priors.lower[one.values.stop - 1]), float(priors.upper[one.values.stop - 1])
 

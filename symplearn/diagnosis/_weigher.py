@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from .._effects import OUTLIERS, STOP
 from ._along import along, readings
-from ._calibrate import Fits, Priors, grow, residuals, weights
+from ._calibrate import Fits, Priors, grow, residuals, weight_of, weights
 from ._clock import weigh_known_clock
 from ._coloured import Colour
 from ._found import Found
@@ -115,20 +115,22 @@ class Weigher:
         used = np.isfinite(errors) & ~flagged
         rest = np.sqrt((np.where(used, errors, 0.0) ** 2).sum(0) / np.maximum(used.sum(0), 1))
         less = np.isnan(self.problem.noise) & (rest > 0) & (rest < 1)
-        return self._owed(members, errors / np.where(less, rest, 1.0), flagged, fit.noise)
+        weight = np.concatenate(weights(self.plain.problem, self.rows))
+        return self._owed(members, errors / np.where(less, rest, 1.0), flagged, fit.noise, weight)
 
-    def _owed(self, members: Combination, errors: np.ndarray, flagged: np.ndarray, noise: np.ndarray) -> float:
+    def _owed(
+        self, members: Combination, errors: np.ndarray, flagged: np.ndarray, noise: np.ndarray, weight: np.ndarray
+    ) -> float:
         """Log evidence of the readings that were taken out, as a density in their own unit; one that averages several
         errs by less."""
         value = outlier_evidence(members, self.plain.problem, errors, flagged)
-        weight = np.concatenate(weights(self.plain.problem, self.rows))
         return value - float((flagged * (np.log(noise) - 0.5 * np.log(np.where(flagged, weight, 1.0)))).sum())
 
     def _path_errors(self, fit: PathFit, r: int) -> np.ndarray:
         """Readings less those on a path, by their noise; NaN where nothing was read."""
         read = self.plain.problem.rows[r].readings[: self.rows[r]]
         shown = along(self.problem, readings, r, fit.z, (), fit.paths[r])
-        weight = weights(self.plain.problem, self.rows)[r]
+        weight = weight_of(self.plain.problem.rows[r].counts[: self.rows[r]])
         return np.where(weight > 0, np.sqrt(weight) * (read - shown) / fit.noise, np.nan)
 
     def weigh(self, starts: Sequence[Start], whole: bool = False) -> None:
@@ -243,7 +245,7 @@ class Weigher:
         errors = standardised([x[lane] for x in r], weight, fits.noise[lane])
         flagged = np.concatenate([bad[:n] for bad, n in zip(self.flagged, self.rows, strict=True)])
         told = [outliers(errors[:, j], flagged[:, j]) for j in range(self.problem.channels)]
-        value = self._owed(self.base, errors, flagged, fits.noise[lane])
+        value = self._owed(self.base, errors, flagged, fits.noise[lane], np.concatenate(weight))
         return value, tuple((share, size * float(s)) for (share, size), s in zip(told, fits.noise[lane], strict=True))
 
     def weigh_with_outliers_in(self) -> None:
