@@ -32,6 +32,15 @@ def test_eight_long_recordings_stay_small():
     assert {int(number) for _, number in headings} == set(range(1, 7))
 
 
+@pytest.mark.parametrize(("told", "drawn"), [([2], 2), ([1, 2], 1), ([], 1)])
+def test_the_force_is_drawn_where_something_is_missing(told, drawn):
+    """Of several recordings the force and the energy are of the first that the location names, as its sentence is."""
+    one = cases.damped_pendulum(series=(cases.series(rows=80, end=4.0, seed=1), cases.series(rows=80, end=4.0, seed=2)))
+    place = one.document["location"] | {"recordings": told}
+    page = html_report(dataclasses.replace(one, document=one.document | {"location": place}))
+    assert re.findall(r"<h3>(?:Missing force on \w+|Energy) in recording (\d)", page) == [str(drawn)] * 2
+
+
 def test_a_simulation_that_diverges_is_still_drawn():
     """Huge values and infinities break no picture and stretch no axis beyond three times its range."""
     bad = (1e200, 1e308, np.inf, np.nan)

@@ -26,7 +26,7 @@ def plates(diagnosis: Diagnosis) -> list[Plate]:
     drawn = [_motion(diagnosis, i, column) for i, column in _drawn_motions(diagnosis)]
     if diagnosis.series:
         drawn += [_forces(diagnosis, q) for q in diagnosis.coordinates[:COORDINATES]]
-        drawn.append(Plate("Energy", _ENERGY, tuple(energy_panels(diagnosis, diagnosis.series[0]))))
+        drawn.append(_energy(diagnosis))
     drawn.append(Plate("Forecast", _FORECAST, tuple(forecast_panels(diagnosis, diagnosis.columns[:COLUMNS]))))
     return [plate for plate in drawn if plate.panels]
 
@@ -77,7 +77,18 @@ def _motion(diagnosis: Diagnosis, i: int, column: str) -> Plate:
     return Plate(heading, (_MOTION if one.held_out else _ALL_FITTED) if first else "", tuple(panels))
 
 
+def _told(diagnosis: Diagnosis) -> tuple[int, str]:
+    """The first recording that something is missing in, counted from 1, and how a heading says so among several."""
+    number = min(diagnosis.document["location"]["recordings"], default=1)
+    return number, f" in recording {number}" if len(diagnosis.series) > 1 else ""
+
+
 def _forces(diagnosis: Diagnosis, coordinate: str) -> Plate:
-    one = missing(diagnosis, diagnosis.series[0], 1, coordinate)
-    where = " in recording 1" if len(diagnosis.series) > 1 else ""
+    number, where = _told(diagnosis)
+    one = missing(diagnosis, diagnosis.series[number - 1], number, coordinate)
     return Plate(f"Missing force on {coordinate}{where}", _FORCES, tuple(force_panels(one, coordinate)))
+
+
+def _energy(diagnosis: Diagnosis) -> Plate:
+    number, where = _told(diagnosis)
+    return Plate(f"Energy{where}", _ENERGY, tuple(energy_panels(diagnosis, diagnosis.series[number - 1])))
