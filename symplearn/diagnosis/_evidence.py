@@ -10,6 +10,8 @@ from scipy.stats import multivariate_normal
 
 # Probabilities of a half space below this are as good as impossible.
 _TINY = 1e-300
+# Of the variance of what is known to be on one side of a bound.
+_ROUND_OFF = 1e-12
 # Standard deviations that a variance of block sums may lie above its expectation and still be chance.
 _CHANCE = 2.5
 # Standard deviations beyond a bound from which a cubature of the allowed region is no longer to be trusted.
@@ -123,20 +125,27 @@ def orthants(
 
     Exact for one and for independent ones, a good approximation for others (Mendell and Elston 1974).
     """
-    reach, covariance, total = centre.copy(), covariance.copy(), np.zeros(centre.shape[:-1])
+    return cut_off(centre, covariance, np.ones(centre.shape[-1], bool))[0]
+
+
+def cut_off(
+    centre: Float[np.ndarray, "*lane n"], covariance: Float[np.ndarray, "*lane n n"], some: Bool[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "*lane"], Float[np.ndarray, "*lane n"], Float[np.ndarray, "*lane n n"]]:
+    """The same of some of them, and mean and covariance of all given that those are positive."""
+    mean, covariance, total = centre.copy(), covariance.copy(), np.zeros(centre.shape[:-1])
     diagonal = np.arange(centre.shape[-1])
-    for i in diagonal:
+    least = _ROUND_OFF * covariance[..., diagonal, diagonal]
+    for i in np.nonzero(some)[0]:
         spread = np.sqrt(np.maximum(covariance[..., i, i], _TINY))
-        r = reach[..., i] / spread
+        r = mean[..., i] / spread
         mass = log_ndtr(r)
         total, shift = total + mass, np.exp(log_density(r) - mass)
         with_i = covariance[..., i] / spread[..., None]
-        reach = reach + with_i * shift[..., None]
+        mean = mean + with_i * shift[..., None]
         less = (shift * (shift + r))[..., None, None]
         covariance = covariance - with_i[..., :, None] * with_i[..., None, :] * less
-        held = np.maximum(covariance[..., diagonal, diagonal], 1e-12)
-        covariance[..., diagonal, diagonal] = held
-    return np.asarray(total)
+        covariance[..., diagonal, diagonal] = np.maximum(covariance[..., diagonal, diagonal], least)
+    return np.asarray(total), mean, covariance
 
 
 def variance_inflation(scores: Float[np.ndarray, "time z"], blocks: tuple[int, ...] = (12, 24, 48)) -> float:

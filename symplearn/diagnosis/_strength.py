@@ -21,8 +21,9 @@ from scipy.stats import norm
 from .._effects import EXCITATION
 from ._activity import log_fed
 from ._calibrate import Priors
-from ._evidence import log_density, orthants
+from ._evidence import cut_off, log_density
 from ._problem import Combination, Problem
+from ._squares import log_product_of_squares
 
 # Widths of the mixture, and the narrowest of them in standard deviations of the estimate.
 WIDTHS, _SEEN = 7, 4.0
@@ -137,8 +138,7 @@ def mixture_gains(
     along = np.einsum("lij,li->lj", vectors, np.where(sound[:, None], centre, 0.0))
     if effects == 1 and a > _MANY:
         widths = np.concatenate([_shares(values, alone), np.ones((len(centre), 1))], axis=1)
-        logs, squares = _log_weights_of_one(vectors, bare, along / left, widths, lowest)
-        return _gains(logs, squares, own, alone, sound)
+        return _gains(_log_weights_of_one(vectors, bare, along / left, widths, lowest, alone), sound)
     likelihood = (vectors * bare[:, None]) @ vectors.mT
     told = np.einsum("lij,lj->li", vectors, along / left)
     parts = [_eigenvalues(spread[:, own == k][:, :, own == k]) for k in range(effects)]
@@ -147,17 +147,11 @@ def mixture_gains(
     widths = shares[:, np.arange(effects), choices][..., own]
     # The widest priors last, whose effects may be too weak to be seen.
     every = np.concatenate([widths, np.ones((len(centre), 1, a))], axis=1)
-    logs, squares = _log_weights(told, likelihood, every, lowest)
-    return _gains(logs, squares, own, alone, sound)
+    return _gains(_log_weights(told, likelihood, every, lowest, own, alone), sound)
 
 
-def _gains(
-    logs: Float[np.ndarray, "lane choice"], squares: Float[np.ndarray, "lane choice a"], own: np.ndarray, alone: bool,
-    sound: Bool[np.ndarray, " lane"],
-) -> Float[np.ndarray, " lane"]:  # fmt: skip
+def _gains(logs: Float[np.ndarray, "lane choice"], sound: Bool[np.ndarray, " lane"]) -> Float[np.ndarray, " lane"]:
     """What all choices of widths gain over the widest, which is the last."""
-    if not alone:
-        logs[:, :-1] += sum(np.log(squares[:, :-1, own == k].mean(-1)) for k in range(int(own[-1]) + 1))
     gains = np.logaddexp.reduce(logs[:, :-1], axis=1) - np.log(logs.shape[1] - 1) - logs[:, -1]
     return np.where(sound & np.isfinite(gains), gains, 0.0)
 
@@ -196,10 +190,11 @@ def _diagonal(matrices: Float[np.ndarray, "*lane a a"]) -> Float[np.ndarray, "*l
 
 def _log_weights(
     told: Float[np.ndarray, "lane a"], likelihood: Float[np.ndarray, "lane a a"],
-    widths: Float[np.ndarray, "lane choice a"], lowest: Float[np.ndarray, " a"],
-) -> tuple[Float[np.ndarray, "lane choice"], Float[np.ndarray, "lane choice a"]]:  # fmt: skip
-    """Log evidence of every choice of widths, up to one constant, and by entry the posterior's mean square in the
-    prior's."""
+    widths: Float[np.ndarray, "lane choice a"], lowest: Float[np.ndarray, " a"], own: Int[np.ndarray, " a"],
+    alone: bool,
+) -> Float[np.ndarray, "lane choice"]:  # fmt: skip
+    """Log evidence of every choice of widths, up to one constant; of several with the mean of their squares' product,
+    save the widest, the last."""
     prior = widths**2
     total = likelihood[:, None] + prior[..., None] * np.eye(told.shape[-1])
     scale = np.sqrt(_diagonal(total))
@@ -212,15 +207,20 @@ def _log_weights(
     some = np.isfinite(lowest)
     centre, covariance = prior * solved, prior[..., None] * (inverse @ likelihood[:, None])
     if some.any():
-        out += orthants(centre[..., some] - lowest[some], covariance[..., some, :][..., some])
-        out -= log_ndtr(-lowest[some] / widths[..., some]).sum(-1)
-    return out, _square(centre, _diagonal(covariance), lowest) / _square(np.zeros_like(centre), prior, lowest)
+        mass, centre, covariance = cut_off(centre - np.where(some, lowest, 0.0), covariance, some)
+        centre = centre + np.where(some, lowest, 0.0)
+        out += mass - log_ndtr(-lowest[some] / widths[..., some]).sum(-1)
+    if not alone:
+        unit = np.sqrt(_squares(widths, lowest) * np.bincount(own)[own])
+        scaled = covariance / (unit[..., :, None] * unit[..., None, :])
+        out[:, :-1] += log_product_of_squares(centre / unit, scaled, own)[:, :-1]
+    return out
 
 
 def _log_weights_of_one(
     vectors: Float[np.ndarray, "lane a a"], values: Float[np.ndarray, "lane a"], told: Float[np.ndarray, "lane a"],
-    widths: Float[np.ndarray, "lane choice"], lowest: Float[np.ndarray, " a"],
-) -> tuple[Float[np.ndarray, "lane choice"], Float[np.ndarray, "lane choice a"]]:  # fmt: skip
+    widths: Float[np.ndarray, "lane choice"], lowest: Float[np.ndarray, " a"], alone: bool,
+) -> Float[np.ndarray, "lane choice"]:  # fmt: skip
     """The same where all entries are one effect's, of one width: in the axes of the likelihood's covariance, for which
     no matrix is inverted. `told` is along these."""
     prior = widths[..., None] ** 2
@@ -228,21 +228,24 @@ def _log_weights_of_one(
     out = -0.5 * (told[:, None] ** 2 / total + np.log(total)).sum(-1)
     centre = np.einsum("lij,lcj->lci", vectors, prior * told[:, None] / total)
     along, some = prior * values[:, None] / total, np.isfinite(lowest)
-    if some.any():
-        covariance = np.einsum("lij,lcj,lkj->lcik", vectors[:, some], along, vectors[:, some])
-        out += orthants(centre[..., some] - lowest[some], covariance)
-        out -= log_ndtr(-lowest[some] / widths[..., None]).sum(-1)
     variance = np.einsum("lij,lcj->lci", vectors**2, along)
-    whole = np.broadcast_to(prior, centre.shape)
-    return out, _square(centre, variance, lowest) / _square(np.zeros_like(centre), whole, lowest)
+    if some.any():
+        beside = np.einsum("lij,lcj,lkj->lcik", vectors, along, vectors[:, some])  # every entry with those
+        before = beside[..., some, :]
+        mass, moved, after = cut_off(centre[..., some] - lowest[some], before, np.ones(int(some.sum()), bool))
+        follow = beside @ np.linalg.inv(before)
+        variance -= np.einsum("lcik,lckm,lcim->lci", follow, before - after, follow)
+        centre = centre + np.einsum("lcik,lck->lci", follow, moved + lowest[some] - centre[..., some])
+        out += mass - log_ndtr(-lowest[some] / widths[..., None]).sum(-1)
+    if not alone:
+        whole = _squares(np.broadcast_to(widths[..., None], centre.shape), lowest)
+        out[:, :-1] += np.log(((centre**2 + variance) / whole).mean(-1))[:, :-1]
+    return out
 
 
-def _square(centre: np.ndarray, variance: np.ndarray, lowest: np.ndarray) -> np.ndarray:
-    """Mean square of Gaussians that are cut off below a bound, each by itself."""
-    if not np.isfinite(lowest).any():
-        return np.maximum(centre**2 + variance, 1e-300)
-    s = np.sqrt(np.maximum(variance, 1e-300))
-    below = np.clip((lowest - centre) / s, -1e3, 1e3)  # far below is no bound
-    edge = np.exp(log_density(below) - log_ndtr(-below))
-    cut = np.where(np.isfinite(lowest), s * (lowest + centre) * edge, 0.0)
-    return np.maximum(centre**2 + variance + cut, 1e-300)
+def _squares(widths: Float[np.ndarray, "lane choice a"], lowest: Float[np.ndarray, " a"]) -> np.ndarray:
+    """Mean squares of the priors, which are cut off below a bound."""
+    below = lowest / widths
+    far = below > -30.0  # further down nothing is cut off
+    edge = np.where(far, np.exp(log_density(np.where(far, below, 0.0)) - log_ndtr(-np.where(far, below, 0.0))), 0.0)
+    return widths**2 * (1.0 + np.where(far, below, 0.0) * edge)
