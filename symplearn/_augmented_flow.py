@@ -18,6 +18,8 @@ from ._effects import BIAS, COULOMB, DELAY, DRIFT, GAIN, IMPULSE
 _STAGES = np.array([[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]])
 # Steps in which a sensor's delay is gone back: half a period then to 5e-4 of the amplitude, where one step is off by 2.
 _BACKWARDS = 8
+# Of a piece of the time before a reading: shorter steps back lie in the latest of them.
+_SHORT = 1e-9
 # What acts in a part of a substep: the Hamiltonian, a kick that belongs to no stage of it, or one that does.
 _FLOW, _KICK, _DRAG = range(3)
 
@@ -213,7 +215,11 @@ def _mean_sign(begin: Float[Array, " d"], end: Float[Array, " d"]) -> Float[Arra
 
 
 class SimulatedReading(eqx.Module):
-    """What the sensors show at a phase point, (1 + g) h(x(t - tau)) + b + r (t - t_0); the context is `(t, inputs)`."""
+    """What the sensors show at a phase point, (1 + g) h(x(t - tau)) + b + r (t - t_0).
+
+    The context is the time and what is known of the inputs: how they stand, or besides the length of pieces of the time
+    before and their means in each, the latest first.
+    """
 
     system: Simulated
 
@@ -223,38 +229,60 @@ class SimulatedReading(eqx.Module):
         self.system = Simulated(equations, parameters, coefficients, switches)
 
     def __call__(
-        self, x: Float[Array, " state"], context: tuple[Float[Array, ""], Float[Array, " input"]]
+        self, x: Float[Array, " state"], context: tuple[Float[Array, ""], Float[Array, " known"]]
     ) -> Float[Array, " channel"]:
-        t, inputs = context
-        system = self.system.at(t, inputs)  # a reading is taken at an instant
+        t, known = context
+        system = self.system.at(t, known)  # a reading is taken at an instant
         off = system.of(BIAS) + system.of(DRIFT) * (t - system.equations.start)
-        seen = self._seen if system.equations.delayed else _shown
-        return (1 + system.of(GAIN)) * seen(system, x) + off
+        seen = self._seen(system, x, known) if system.equations.delayed else _shown(system, x)
+        return (1 + system.of(GAIN)) * seen + off
 
-    def _seen(self, system: SimulatedHamiltonian, x: Array) -> Float[Array, " channel"]:
+    def _seen(self, system: SimulatedHamiltonian, x: Array, known: Array) -> Float[Array, " channel"]:
         """h, of the phase point as it was a delay ago."""
 
         def late(x: Array) -> Array:
-            back = jax.vmap(lambda delay: self._back(x, system.moment.time, system.inputs, -delay))(system.of(DELAY))
+            back = jax.vmap(lambda delay: self._back(x, system.moment.time, known, delay))(system.of(DELAY))
             shown = jax.vmap(lambda x: _shown(system, x))(back)
             return jnp.stack([row[k] for k, row in enumerate(shown)])
 
         return jax.lax.cond(self.system.switches.delays, late, lambda x: _shown(system, x), x)
 
-    def _back(self, x: Array, t: Array, inputs: Array, dt: Array) -> Float[Array, " state"]:
+    def _back(self, x: Array, t: Array, known: Array, delay: Array) -> Float[Array, " state"]:
         """The phase point a little earlier, in steps of classical Runge-Kutta; their stages are one loop, so that the
         rates are compiled once."""
-        h = dt / _BACKWARDS
+        h = -delay / _BACKWARDS
 
-        def stage(carry: tuple[Array, Array, Array], row: Array) -> tuple[tuple[Array, Array, Array], None]:
-            begun, total, rate = carry
-            place, weight, step = row
-            begun = jnp.where(place == 0, total, begun)
-            rate = self.system.at(t + (step + place) * h, inputs).rates(begun + place * h * rate)
-            return (begun, total + weight * h * rate, rate), None
+        def stepped(begun: Array, step: Array) -> tuple[Array, None]:
+            inputs = _inputs_back(known, len(self.system.equations.inputs), -h, step)
 
-        rows = np.column_stack([np.tile(_STAGES, (_BACKWARDS, 1)), np.repeat(np.arange(_BACKWARDS), len(_STAGES))])
-        return jax.lax.scan(stage, (x, x, jnp.zeros_like(x)), jnp.asarray(rows, x.dtype))[0][1]
+            def stage(carry: tuple[Array, Array], row: Array) -> tuple[tuple[Array, Array], None]:
+                (total, rate), (place, weight) = carry, row
+                rate = self.system.at(t + (step + place) * h, inputs).rates(begun + place * h * rate)
+                return (total + weight * h * rate, rate), None
+
+            return jax.lax.scan(stage, (begun, jnp.zeros_like(x)), jnp.asarray(_STAGES, x.dtype))[0][0], None
+
+        return jax.lax.scan(stepped, x, jnp.arange(_BACKWARDS, dtype=x.dtype))[0]
+
+
+def _inputs_back(
+    known: Float[Array, " known"], number: int, length: Float[Array, ""], step: Float[Array, ""]
+) -> Float[Array, " input"]:
+    """The inputs' mean in one of the steps of some length back from a reading; as they stand, where no more is
+    known."""
+    now = known[:number]
+    if len(known) == number:
+        return now
+    piece, means = known[number], known[number + 1 :].reshape(-1, number)
+
+    def since(age: Array) -> Float[Array, " input"]:
+        """Their integral from so long before the reading on."""
+        inside = jnp.clip(age - piece * np.arange(len(means)), 0.0, piece)
+        return inside @ means + jnp.maximum(age - piece * len(means), 0.0) * means[-1] + jnp.minimum(age, 0.0) * now
+
+    is_short = jnp.abs(length) <= _SHORT * piece
+    mean = (since((step + 1.0) * length) - since(step * length)) / jnp.where(is_short, 1.0, length)
+    return jnp.where(is_short, means[0], mean)
 
 
 def _shown(system: SimulatedHamiltonian, x: Float[Array, " state"]) -> Float[Array, " channel"]:

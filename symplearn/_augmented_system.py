@@ -198,9 +198,11 @@ class Simulated(eqx.Module):
         self.values = taken_apart(equations, self.coefficients)
 
     def at(
-        self, t: Float[Array, ""] | float, inputs: Float[Array, " input"], width: Float[Array, ""] | float = 1e-9
+        self, t: Float[Array, ""] | float, inputs: Float[Array, " known"], width: Float[Array, ""] | float = 1e-9
     ) -> SimulatedHamiltonian:
-        """The system with all that depends on time as it stands at one time; `width` as in `moment`."""
+        """The system with all that depends on time as it stands at one time; `width` as in `moment`. What is known of
+        the time before the inputs is of no account."""
+        inputs = inputs[: len(self.equations.inputs)]
         moment = self.moment(jnp.asarray(t, self.coefficients.dtype), width)
         return SimulatedHamiltonian(self.equations, self.coefficients, self.values, inputs, moment, self.switches)
 

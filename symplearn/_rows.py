@@ -15,6 +15,8 @@ from ._thinning import Thinned, thin, thinning_width
 
 # A gap this much wider than the usual one is bridged by rows without readings, so that one substep fits all spans.
 _WIDE = 1.5
+# Rows that a sensor may be late by, and pieces of that time of which each row is told the inputs' means.
+LATEST, _PIECES = 5.0, 20
 # Fitted rows of one recording beyond which the first ones are left out; the last ones lead up to the held-out part.
 _LONGEST = 15_000
 
@@ -36,14 +38,15 @@ class Rows:
     """One recording ready to be stepped through.
 
     `readings` (n, m) are NaN where there is none; `counts` (n, m) tell how many original readings each one averages.
-    The first `fitted` rows are for fitting, the others are held out. `spans` has n - 1 entries.
+    The first `fitted` rows are for fitting, the others are held out. `spans` has n - 1 entries. `inputs` are what is
+    known of the inputs at each row, as `known_inputs` has them.
     """
 
     times: Float[np.ndarray, " time"]
     readings: Float[np.ndarray, "time channel"]
     counts: Float[np.ndarray, "time channel"]
     spans: Span
-    inputs: Float[np.ndarray, "time input"]
+    inputs: Float[np.ndarray, "time known"]
     fitted: int
     given: int  # rows before thinning
     used: int  # rows after thinning, without those that bridge gaps
@@ -56,18 +59,21 @@ class Rows:
 
 
 def lay_out(
-    recordings: Sequence[HasRows], holdout: float, width: float, substep: float, is_begun: bool = True
-) -> list[Rows]:
+    recordings: Sequence[HasRows], holdout: float, width: float, substep: float, is_begun: bool = True,
+    lateness: float | None = None,
+) -> list[Rows]:  # fmt: skip
     """Thin recordings into bins of `width`, split off the held-out parts, and lay spans of at most `substep`.
 
     All recordings get the same number of substeps per span, so that one compiled function serves them all. Where the
     state at the first row is known (`is_begun`), that row stays as it is; where not, the first rows of a recording that
-    holds more than can be fitted in minutes, even after thinning, are left out.
+    holds more than can be fitted in minutes, even after thinning, are left out. With a `lateness`, of sensors that are
+    known to be late, every row knows the inputs that long before it and `LATEST` rows more.
     """
     thinned = [_thinned(recording, holdout, width, is_begun) for recording in recordings]
-    pieces = max(math.ceil(np.median(np.diff(rows.times)) / substep - 1e-9) for rows, _ in thinned)
+    usual = max(float(np.median(np.diff(rows.times))) for rows, _ in thinned)
+    pieces, past = math.ceil(usual / substep - 1e-9), None if lateness is None else LATEST * usual + lateness
     return [
-        _one(recording, rows, first, max(1, pieces), holdout)
+        _one(recording, rows, first, max(1, pieces), holdout, past)
         for recording, (rows, first) in zip(recordings, thinned, strict=True)
     ]
 
@@ -88,7 +94,9 @@ def _thinned(recording: HasRows, holdout: float, width: float, is_begun: bool) -
     return Thinned(*joined), fitted - late
 
 
-def _one(recording: HasRows, rows: Thinned, first: int, pieces: int, holdout: float) -> Rows:
+def _one(
+    recording: HasRows, rows: Thinned, first: int, pieces: int, holdout: float, past: float | None
+) -> Rows:  # fmt: skip
     places, times = _bridged(rows.times, float(np.median(np.diff(rows.times))))
     readings, counts = (np.full((len(times), rows.readings.shape[1]), fill) for fill in (np.nan, 0.0))
     readings[places], counts[places] = rows.readings, rows.counts
@@ -97,7 +105,7 @@ def _one(recording: HasRows, rows: Thinned, first: int, pieces: int, holdout: fl
         readings=readings,
         counts=counts,
         spans=spans_between(times, pieces, recording.inputs),
-        inputs=_at(recording.inputs, times),
+        inputs=known_inputs(recording.inputs, times, past),
         fitted=int(places[first - 1]) + 1,
         given=len(recording.times),
         used=len(rows.times),
@@ -132,5 +140,19 @@ def spans_between(times: Float[np.ndarray, " time"], pieces: int, inputs: Any) -
     )
 
 
-def _at(inputs: Any, times: np.ndarray) -> np.ndarray:
-    return np.zeros((len(times), 0)) if inputs is None else np.asarray(inputs.at(times))
+def known_inputs(inputs: Any, times: Float[np.ndarray, " time"], past: float | None) -> Float[np.ndarray, "time known"]:
+    """What a row knows of the inputs: how they stand, and of the time before, over `past`, the length of each of twenty
+    pieces of it and their means in them, the latest first. Before they are known they stand as they begin."""
+    if inputs is None:
+        return np.zeros((len(times), 0))
+    now = np.asarray(inputs.at(times))
+    if past is None:
+        return now
+    edges = np.maximum(times[:, None] - past / _PIECES * np.arange(_PIECES + 1), min(inputs.times[0], times[0]))
+    means = inputs.mean_over(edges[:, 1:].ravel(), edges[:, :-1].ravel())
+    return np.concatenate([now, np.full((len(times), 1), past / _PIECES), means.reshape(len(times), -1)], axis=1)
+
+
+def past_of(known: Float[np.ndarray, "time known"], inputs: int) -> float | None:
+    """Over which time before it a row knows its inputs; None where it does not."""
+    return float(_PIECES * known[0, inputs]) if known.shape[1] > inputs else None

@@ -31,6 +31,7 @@ SUBSTEPS = 8
 # to order two, which effects of velocity are stepped to, and of 256 to order four.
 _CHANGE = 0.1
 _SETTLING = 0.1  # of the first change: order one would leave a thousandth after the last halving
+_BROAD = 3.0  # standard deviations that a known delay may be longer
 _HALVINGS = 6  # the first of them may only keep a stiff motion from being thrown out
 
 
@@ -109,7 +110,8 @@ def build(
 ) -> Problem:
     """Lay the recordings out and gather every prior."""
     # A prior of the initial state belongs to the first row, which must then stay.
-    rows = tuple(lay_out(recordings, holdout, averaged_over(file, recordings), substep, is_begun=bool(file.initial)))
+    averaged, lateness = averaged_over(file, recordings), _lateness(file) if built.delayed else None
+    rows = tuple(lay_out(recordings, holdout, averaged, substep, bool(file.initial), lateness))
     parameters, known, calibrated = _values(file, built, len(recordings))
     return Problem(
         equations=built,
@@ -128,6 +130,12 @@ def build(
         units=dict(file.units),
         known_outliers=tuple(j for j, c in enumerate(built.columns) if _has_outliers(file, c)),
     )
+
+
+def _lateness(file: SimulationFile) -> float:
+    """How late sensors may be by what is known of them."""
+    known = (quantity for term in file.terms if term.effect == DELAY.name for quantity in term.coefficients.values())
+    return sum((abs(one.value) + _BROAD * (0.0 if one.sd is None else one.sd) for one in known), 0.0)
 
 
 def averaged_over(file: SimulationFile, recordings: Sequence[HasRows]) -> float:

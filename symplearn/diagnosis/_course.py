@@ -26,7 +26,7 @@ class Course(eqx.Module):
 
     spans: Span
     times: Float[Array, " time"]
-    inputs: Float[Array, "time input"]
+    inputs: Float[Array, "time known"]
     parameters: Float[Array, " parameter"]
     terms: Float[Array, " coefficient"]
     # How calibrated values enter the parameters and the coefficients.

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from .. import _effects as effects
 from .._effects import Candidate, Drag, Oscillating, PowerForce
+from .._rows import LATEST
 from ._activity import powers
 from ._calibrate import Priors, even
 from ._memories import Span
@@ -22,8 +23,6 @@ STRENGTH = 0.3
 _DEPTH = 3e-5
 # Root mean square over the recording of what grows evenly to one, and of what is one in half of it: their inverses.
 _EVEN, _HALF = np.sqrt(3.0), np.sqrt(2.0)
-# A delay is a few samples at most.
-_SAMPLES = 5.0
 
 
 def with_effects(problem: Problem, priors: Priors, motion: Motion) -> Priors:
@@ -36,7 +35,7 @@ def with_effects(problem: Problem, priors: Priors, motion: Motion) -> Priors:
             loose = _looseness(problem, priors, motion, one.place)
             scales[amplitudes] *= np.hypot(1.0, loose / STRENGTH) * np.hypot(1.0, loose)
         if one.effect is effects.DELAY:
-            upper[one.first] = _SAMPLES * motion.gap
+            upper[one.first] = LATEST * motion.gap
         if one.effect.places:
             place = amplitudes.stop
             low, high = _range(motion, one)
@@ -70,7 +69,7 @@ def _unit(motion: Motion, one: Candidate) -> tuple[float, ...]:
     if one.effect.acts_on == effects.COLUMN:
         level = motion.levels[one.place]
         units = {effects.BIAS: level, effects.GAIN: 1.0, effects.DRIFT: _EVEN * level / motion.span}
-        return (units.get(one.effect, _SAMPLES / 2 * motion.gap / STRENGTH),) * one.effect.amplitudes
+        return (units.get(one.effect, LATEST / 2 * motion.gap / STRENGTH),) * one.effect.amplitudes
     if one.effect.acts_on == effects.PARAMETER:
         later = {effects.DRIFTING: _EVEN / motion.span, effects.REGIME: _HALF}
         return (later.get(one.effect, 1.0),) * one.effect.amplitudes

@@ -13,7 +13,7 @@ from .._augmented_flow import Span
 from .._errors import InputError
 from .._importance import softened
 from .._recording import Recording
-from .._rows import spans_between
+from .._rows import known_inputs, past_of, spans_between
 from .._triangular import semidefinite_cholesky
 from ._bend import bent
 from ._course import effect_coefficients, model_at
@@ -149,7 +149,8 @@ def _ahead(problem: Problem, recording: Recording, times: np.ndarray, finer: int
     spans = problem.rows[0].spans
     path = np.concatenate([problem.rows[0].times[-1:], times])
     pieces = finer * max(1, math.ceil(np.max(np.diff(path)) / float(np.max(spans.step)) - 1e-9))
-    inputs = np.zeros((len(times), 0)) if recording.inputs is None else recording.inputs.at(times)
+    past = past_of(problem.rows[0].inputs, len(problem.equations.inputs))
+    inputs = known_inputs(recording.inputs, times, past)
     return spans_between(path, pieces, recording.inputs), jnp.asarray(times), jnp.asarray(inputs)
 
 

@@ -32,7 +32,7 @@ class Rail:
     """What a recording gives to its trajectories, as the machine reads it."""
 
     times: Float[np.ndarray, " time"]
-    inputs: Float[np.ndarray, "time input"]
+    inputs: Float[np.ndarray, "time known"]
     starts: Float[np.ndarray, " time"]
     steps: Float[np.ndarray, " time"]
     pieces: Int[np.ndarray, " time"]
@@ -62,12 +62,15 @@ class Rail:
 
 
 @lru_cache(maxsize=4)
-def native_rows(equations: Equations, integrator: ig.AbstractIntegrator, inputs: int) -> "NativeRows | None":
-    """The machine code of a simulation, written once; None where there is none, or the work is not a processor's."""
+def native_rows(equations: Equations, integrator: ig.AbstractIntegrator, known: int) -> "NativeRows | None":
+    """The machine code of a simulation, written once; None where there is none, or the work is not a processor's.
+
+    `known` is how many numbers a row knows of the inputs.
+    """
     if jax.default_backend() != "cpu":
         return None
     try:
-        return NativeRows(equations, integrator, inputs)
+        return NativeRows(equations, integrator, known)
     except Unsupported:
         return None
 
@@ -75,11 +78,11 @@ def native_rows(equations: Equations, integrator: ig.AbstractIntegrator, inputs:
 class NativeRows:
     """Readings and phase points at the rows of a recording, and their slopes along `WIDTH` directions."""
 
-    def __init__(self, equations: Equations, integrator: ig.AbstractIntegrator, inputs: int):
+    def __init__(self, equations: Equations, integrator: ig.AbstractIntegrator, known: int):
         sizes = 2 * equations.width, len(equations.parameters), equations.size
         self.state, self.shown = sizes[0], len(equations.columns) + sizes[0]
-        program = _traced(equations, integrator, sizes, inputs)
-        self._engine = compiled(row_loop(program, sizes, inputs, _SWITCHES))
+        program = _traced(equations, integrator, sizes, known)
+        self._engine = compiled(row_loop(program, sizes, (known, len(equations.inputs)), _SWITCHES))
         kinds = [ctypes.c_int64, ctypes.c_int64, *[ctypes.c_void_p] * POINTERS]
         self._run = ctypes.CFUNCTYPE(None, *kinds)(self._engine.get_function_address("rows"))
 
@@ -103,8 +106,9 @@ class NativeRows:
         self._run(len(out), stride, *at[:2], *rail.places, at[2], begun, *at[3:])
 
 
-def _traced(equations: Equations, integrator: ig.AbstractIntegrator, sizes: Sequence[int], inputs: int) -> ClosedJaxpr:
+def _traced(equations: Equations, integrator: ig.AbstractIntegrator, sizes: Sequence[int], known: int) -> ClosedJaxpr:
     """One row of a trajectory: what it shows, and where it leads to."""
+    inputs = len(equations.inputs)
 
     def row(x: Any, parameters: Any, coefficients: Any, t: Any, u: Any, start: Any, step: Any, pieces: Any, means: Any,
             *switches: Any) -> Any:  # fmt: skip
@@ -118,4 +122,4 @@ def _traced(equations: Equations, integrator: ig.AbstractIntegrator, sizes: Sequ
 
     span = shaped(), shaped(), shaped(dtype=int), shaped(MANY if inputs else 1, inputs)
     switches = [shaped(dtype=bool)] * _SWITCHES
-    return jax.make_jaxpr(row)(*(shaped(n) for n in sizes), shaped(), shaped(inputs), *span, *switches)
+    return jax.make_jaxpr(row)(*(shaped(n) for n in sizes), shaped(), shaped(known), *span, *switches)

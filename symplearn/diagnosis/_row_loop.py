@@ -20,12 +20,13 @@ MANY = 1 << 30
 POINTERS = 12
 
 
-def row_loop(program: ClosedJaxpr, sizes: Sequence[int], inputs: int, switches: int) -> ir.Module:
+def row_loop(program: ClosedJaxpr, sizes: Sequence[int], inputs: tuple[int, int], switches: int) -> ir.Module:
     """A module with the function `rows(count, stride, ...)`, which runs `program` for every row.
 
     Its pointers are those of values, slopes, times, inputs, starts, steps, numbers of substeps, means of inputs
     (`stride` numbers a row), switches, a path or nothing, readings and phase points, and their slopes. `sizes` are
-    those of a phase point, the parameters and the coefficients, which the values hold end to end.
+    those of a phase point, the parameters and the coefficients, which the values hold end to end; `inputs` how many
+    numbers a row knows of them, and how many they are.
     """
     module = ir.Module("trajectory")
     real, whole, bits = (kind.as_pointer() for kind in (DOUBLE, INTEGER, ir.IntType(8)))
@@ -49,8 +50,10 @@ def _array(entries: Sequence[Any]) -> np.ndarray:
 class _Rows:
     """Writes the loop."""
 
-    def __init__(self, program: ClosedJaxpr, function: ir.Function, sizes: Sequence[int], inputs: int, switches: int):
-        self.program, self.sizes, self.inputs = program, sizes, inputs
+    def __init__(
+        self, program: ClosedJaxpr, function: ir.Function, sizes: Sequence[int], inputs: tuple[int, int], switches: int
+    ):
+        self.program, self.sizes, (self.known, self.inputs) = program, sizes, inputs
         self.build = ir.IRBuilder(function.append_basic_block("entry"))
         self.code = Code(self.build, WIDTH)
         (self.rows, self.stride, self.values, self.slopes, self.times, self.u, self.starts, self.steps, self.pieces,
@@ -92,11 +95,11 @@ class _Rows:
     def given(self, k: ir.Value) -> list[Any]:
         """What a recording gives to one row: its time and inputs, and the span that follows."""
         build, inputs = self.build, self.inputs
-        first = build.mul(k, _place(inputs))
+        first = build.mul(k, _place(self.known))
         t, *span = (
             _array([self.entry(array, k)]).reshape(()) for array in (self.times, self.starts, self.steps, self.pieces)
         )
-        u = _array([self.entry(self.u, build.add(first, _place(j))) for j in range(inputs)])
+        u = _array([self.entry(self.u, build.add(first, _place(j))) for j in range(self.known)])
         table = Table(build.gep(self.means, [build.mul(k, self.stride)]), (MANY, inputs))
         start, step, pieces = span
         return [t, u, start, step, pieces, table if inputs else np.empty((1, 0), object)]

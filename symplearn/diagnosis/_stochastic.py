@@ -119,7 +119,8 @@ def softness(problem: Problem, course: Course, z: np.ndarray, recording: int) ->
     """d2H/dp_i2 at the initial phase point, by which a missing impulse becomes a missing velocity."""
     eq = problem.equations
     x = z[recording * problem.state : (recording + 1) * problem.state].reshape(2, -1)[:, : eq.dim].ravel()
-    rest = [problem.parameter_values(recording, z), np.asarray(course.inputs)[0], np.asarray(course.times)[:1]]
+    inputs = np.asarray(course.inputs)[0, : len(eq.inputs)]
+    rest = [problem.parameter_values(recording, z), inputs, np.asarray(course.times)[:1]]
     return np.asarray(eq.softness(jax.device_put(np.concatenate([x, *rest, np.zeros(eq.size)]))))
 
 

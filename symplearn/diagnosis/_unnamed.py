@@ -107,7 +107,8 @@ def along_path(
     function = numpy_function(list(terms), [file.symbols[name] for name in names])
     fixed = np.broadcast_to(parameters[:, None], (len(parameters), len(path)))
     with np.errstate(all="ignore"):
-        return np.asarray(function(np.concatenate([path.T, fixed, inputs.T, times[None]]))).T
+        known = inputs.T[: len(file.recording.inputs)]
+        return np.asarray(function(np.concatenate([path.T, fixed, known, times[None]]))).T
 
 
 def stable_terms(
