@@ -67,10 +67,27 @@ def test_an_entry_without_a_prior_has_an_evidence_at_its_bound():
     assert at_bound.log_evidence == pytest.approx(free.log_evidence - np.log(2), abs=1e-6)
 
 
-def test_inside_its_bounds_nothing_changes():
-    """An entry between its bounds, or pushed away from one, is integrated as if there were none."""
+@pytest.mark.parametrize("side", [0, 1])
+@pytest.mark.parametrize("apart", [0.0, 0.1, 0.3])
+def test_near_its_bound_an_entry_is_integrated_inside(apart, side):
+    """Of an entry that stands near a bound, or at it and is pushed away, what lies beyond does not count: SciPy's
+    quadrature over both entries."""
+    begin, sign = np.array([1.0, 2.0]), 1 - 2 * side
+    error = sign * COLUMNS[0] / (COLUMNS[0] @ COLUMNS[0]) + 0.4 * COLUMNS[1]
+    bounds = tuple(bound.copy() for bound in FREE)
+    bounds[side][0] = begin[0] - sign * apart
+    found = evaluated(error, begin, bounds)
+    top = log_density(error, begin, begin)
+    x = (bounds[side][0], bounds[side][0] + sign * 3.0)
+    mass, _ = dblquad(lambda y, x: np.exp(log_density(error, np.array([x, y]), begin) - top), min(x), max(x), -2.0, 6.0)
+    # The quadrature is good to 1e-8 of what is inside, SciPy's probability of a quadrant to 1e-5.
+    assert found.log_evidence == pytest.approx(top + np.log(mass), abs=1e-4)
+    assert found.log_evidence < evaluated(error, begin, FREE).log_evidence - 0.01
+
+
+def test_far_inside_its_bounds_nothing_changes():
+    """An entry many standard deviations from its bounds is integrated as if there were none."""
     begin = np.array([1.0, 2.0])
     error = 5.0 * COLUMNS[0] / (COLUMNS[0] @ COLUMNS[0])
     free = evaluated(error, begin, FREE)
-    assert evaluated(error, begin, (np.array([0.9, -np.inf]), FREE[1])).log_evidence == free.log_evidence
-    assert evaluated(error, begin, (np.array([1.0, -np.inf]), FREE[1])).log_evidence == free.log_evidence
+    assert evaluated(error, begin, (np.array([-1.0, -np.inf]), FREE[1])).log_evidence == free.log_evidence

@@ -14,6 +14,8 @@ _TINY = 1e-300
 _ROUND_OFF = 1e-12
 # Standard deviations that a variance of block sums may lie above its expectation and still be chance.
 _CHANCE = 2.5
+# Standard deviations inside a bound beyond which nothing lies.
+_CERTAIN = 8.0
 # Standard deviations beyond a bound from which a cubature of the allowed region is no longer to be trusted.
 _FAR = -4.0
 
@@ -42,7 +44,8 @@ def laplace(
 
     **Arguments:** - `gram`: of the columns [e0, E]. - `offset`: minus half of what does not depend on d. - `lower`: the
     entries of z that are physical only above a bound; prior and posterior are cut off there. - `bounds`: what no fit
-    leaves. An entry that stands at one and is pushed against it takes no step; what lies inside is integrated.
+    leaves. An entry that stands at one and is pushed against it takes no step; what lies inside is integrated, by the
+    density of the priors as they are.
     """
     slope = gram[0, 1:] - precision * (z - mean)
     pushed = active & ((z <= bounds[0]) & (slope < 0) | (z >= bounds[1]) & (slope > 0))
@@ -73,7 +76,8 @@ def laplace(
         mass, covariance[k, k] = _beyond(abs(slope[k] - float(cross @ full_step[a])), bend)
         width = np.log(precision[k]) if precision[k] > 0 else 0.0  # without a prior, as of `held`
         value += mass + 0.5 * (width - np.log(2 * np.pi)) - 0.5 * precision[k] * (z[k] - mean[k]) ** 2
-    value += _half_spaces(z + full_step, covariance, mean, precision, lower)
+    value -= _cut_off_prior(mean, precision, lower)
+    value += _mass_inside(z + full_step, covariance, lower, bounds, active & ~pushed)
     return Laplace(float(value) if np.isfinite(value) else -np.inf, full_step, covariance, promised)
 
 
@@ -83,22 +87,32 @@ def _beyond(slope: float, bend: float) -> tuple[float, float]:
     return float(mass), 1.0 / (slope**2 + bend)
 
 
-def _half_spaces(
-    centre: np.ndarray, covariance: np.ndarray, mean: np.ndarray, precision: np.ndarray, lower: dict[int, float]
-) -> float:
-    """Log posterior mass over log prior mass of the region that signs allow."""
-    if not lower:
+def _cut_off_prior(mean: np.ndarray, precision: np.ndarray, lower: dict[int, float]) -> float:
+    """Log prior mass of the region that signs allow."""
+    places, low = np.array(list(lower), int), np.array(list(lower.values()))
+    return float(log_ndtr((mean[places] - low) * np.sqrt(precision[places])).sum())
+
+
+def _mass_inside(
+    centre: np.ndarray, covariance: np.ndarray, lower: dict[int, float], bounds: tuple[np.ndarray, np.ndarray],
+    free: np.ndarray,
+) -> float:  # fmt: skip
+    """Log posterior mass of the region that signs allow, and of what is free between the bounds that no fit leaves; a
+    fit on its way beyond one of these will stay at it."""
+    sd = np.sqrt(np.diag(covariance))
+    signs = np.full(len(sd), -np.inf)
+    signs[list(lower)] = list(lower.values())
+    below, above = (np.where(free, np.maximum(gap, 0.0), np.inf) for gap in (centre - bounds[0], bounds[1] - centre))
+    below = np.minimum(below, centre - signs)
+    some = np.nonzero((sd > 0) & (np.minimum(below, above) < _CERTAIN * sd))[0]
+    if not len(some):
         return 0.0
-    places, bounds = np.array(list(lower)), np.array(list(lower.values()))
-    sd = np.sqrt(np.diag(covariance)[places])
-    reach = (centre[places] - bounds) / sd
-    if len(places) == 1:
-        mass = float(log_ndtr(reach[0]))
-    else:
-        correlation = covariance[np.ix_(places, places)] / np.outer(sd, sd) + 1e-10 * np.eye(len(places))
-        mass = _orthant(reach, correlation)
-    prior = log_ndtr((mean[places] - bounds) * np.sqrt(precision[places])).sum()
-    return mass - float(prior)
+    side = np.where(above < below, -1.0, 1.0)[some]
+    reach = np.minimum(below, above)[some] / sd[some]
+    if len(some) == 1:
+        return float(log_ndtr(reach[0]))
+    scale = side * sd[some]
+    return _orthant(reach, covariance[np.ix_(some, some)] / np.outer(scale, scale) + 1e-10 * np.eye(len(some)))
 
 
 def _orthant(reach: np.ndarray, correlation: np.ndarray) -> float:
