@@ -211,7 +211,7 @@ def _log_weights(
         centre = centre + np.where(some, lowest, 0.0)
         out += mass - log_ndtr(-lowest[some] / widths[..., some]).sum(-1)
     if not alone:
-        unit = np.sqrt(_squares(widths, lowest) * np.bincount(own)[own])
+        unit = np.sqrt(_prior_squares(widths, lowest) * np.bincount(own)[own])
         scaled = covariance / (unit[..., :, None] * unit[..., None, :])
         out[:, :-1] += log_product_of_squares(centre / unit, scaled, own)[:, :-1]
     return out
@@ -238,12 +238,12 @@ def _log_weights_of_one(
         centre = centre + np.einsum("lcik,lck->lci", follow, moved + lowest[some] - centre[..., some])
         out += mass - log_ndtr(-lowest[some] / widths[..., None]).sum(-1)
     if not alone:
-        whole = _squares(np.broadcast_to(widths[..., None], centre.shape), lowest)
+        whole = _prior_squares(np.broadcast_to(widths[..., None], centre.shape), lowest)
         out[:, :-1] += np.log(((centre**2 + variance) / whole).mean(-1))[:, :-1]
     return out
 
 
-def _squares(widths: Float[np.ndarray, "lane choice a"], lowest: Float[np.ndarray, " a"]) -> np.ndarray:
+def _prior_squares(widths: Float[np.ndarray, "lane choice a"], lowest: Float[np.ndarray, " a"]) -> np.ndarray:
     """Mean squares of the priors, which are cut off below a bound."""
     below = lowest / widths
     far = below > -30.0  # further down nothing is cut off
