@@ -73,7 +73,7 @@ class Equations:
     def size(self) -> int:
         """Length of the coefficient vector."""
         last = self.candidates[-1]
-        return last.first + last.effect.size + last.effect.switched
+        return last.first + last.effect.entries
 
     def firsts(self, effect: Effect, side: str | None = None) -> np.ndarray:
         """Where the values of an effect start in the coefficient vector, by target."""
@@ -102,7 +102,7 @@ def equations(
     coordinates, momenta, names = known.coordinates, known.momenta, [str(q) for q in known.coordinates]
     varying = {str(p): k for k, p in enumerate(parameters)}
     candidates = vocabulary(names[: known.declared], list(known.readings), varying, nameless)
-    size = sum(one.effect.size + one.effect.switched for one in candidates)
+    size = sum(one.effect.entries for one in candidates)
     c = [sympy.Symbol(f"c{index}*", real=True) for index in range(size)]
     stored = [one for one in candidates if isinstance(one.effect, PowerForce) or one.effect in (SPRING, CENTRAL)]
     energy = known.hamiltonian + sum(c[one.first] * _potential(one, coordinates) for one in stored)

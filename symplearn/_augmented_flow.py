@@ -238,11 +238,15 @@ class SimulatedReading(eqx.Module):
         return (1 + system.of(GAIN)) * seen + off
 
     def _seen(self, system: SimulatedHamiltonian, x: Array, known: Array) -> Float[Array, " channel"]:
-        """h, of the phase point as it was a delay ago."""
+        """h as it was a delay ago, of the phase point, the inputs and all else of then."""
+        t = system.moment.time
+
+        def back(x: Array, delay: Array) -> Float[Array, " channel"]:
+            then = self.system.at(t - delay, _input_then(known, len(self.system.equations.inputs), delay))
+            return _shown(then, self._back(x, t, known, delay))
 
         def late(x: Array) -> Array:
-            back = jax.vmap(lambda delay: self._back(x, system.moment.time, known, delay))(system.of(DELAY))
-            shown = jax.vmap(lambda x: _shown(system, x))(back)
+            shown = jax.vmap(lambda delay: back(x, delay))(system.of(DELAY))
             return jnp.stack([row[k] for k, row in enumerate(shown)])
 
         return jax.lax.cond(self.system.switches.delays, late, lambda x: _shown(system, x), x)
@@ -283,6 +287,19 @@ def _inputs_back(
     is_short = jnp.abs(length) <= _SHORT * piece
     mean = (since((step + 1.0) * length) - since(step * length)) / jnp.where(is_short, 1.0, length)
     return jnp.where(is_short, means[0], mean)
+
+
+def _input_then(known: Float[Array, " known"], number: int, delay: Float[Array, ""]) -> Float[Array, " input"]:
+    """The inputs as they stood a delay ago, from one middle of a piece to the next; as they stand, where no more is
+    known."""
+    now = known[:number]
+    if len(known) == number:
+        return now
+    piece, means = known[number], known[number + 1 :].reshape(-1, number)
+    middles = piece * (np.arange(len(means)) + 0.5)
+    begins, gaps = jnp.append(0.0, middles[:-1]), piece * np.append(0.5, np.ones(len(means) - 1))
+    share = jnp.clip((delay - begins) / jnp.where(gaps > 0, gaps, 1.0), 0.0, 1.0)  # rows that only fill up have none
+    return now + share @ (means - jnp.concatenate([now[None], means[:-1]]))
 
 
 def _shown(system: SimulatedHamiltonian, x: Float[Array, " state"]) -> Float[Array, " channel"]:

@@ -43,10 +43,9 @@ def taken_apart(equations: Equations, coefficients: Float[Array, " coefficient"]
     found = {}
     for one in {(c.effect, c.side): c for c in equations.candidates}.values():
         firsts = equations.firsts(one.effect, one.side)
-        entries = range(one.effect.size + one.effect.switched)
-        found[one.effect.kept_as, one.side] = tuple(coefficients[firsts + k] for k in entries)
+        found[one.effect.kept_as, one.side] = tuple(coefficients[firsts + k] for k in range(one.effect.entries))
     for effect in ON_PARAMETERS:  # of which a simulation may have none
-        found.setdefault((effect.name, None), (coefficients[:0],) * effect.size)
+        found.setdefault((effect.name, None), (coefficients[:0],) * effect.entries)
     return found
 
 
@@ -227,6 +226,6 @@ class Simulated(eqx.Module):
         return Moment(t, jnp.asarray(width, t.dtype), parameters, push)
 
     def _oscillation(self, effect: Effect, t: Array) -> Float[Array, " target"]:
-        cosine, sine, omega = self.values[effect.name, None]
-        angle = omega * (t - self.equations.origin)
+        cosine, sine, omega, later = self.values[effect.name, None]
+        angle = omega * (t - self.equations.origin - later)
         return cosine * jnp.cos(angle) + sine * jnp.sin(angle)

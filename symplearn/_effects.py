@@ -62,6 +62,11 @@ class Effect:
         return self.amplitudes + len(self.places)
 
     @property
+    def entries(self) -> int:
+        """How many entries of the coefficient vector are its own."""
+        return self.size + self.switched
+
+    @property
     def is_additive(self) -> bool:
         """Whether a known effect and a found one simply add up, in one value."""
         return self.size == 1
@@ -104,7 +109,15 @@ class Drag(Effect):
 
 @dataclass(frozen=True)
 class Oscillating(Effect):
-    """a cos(omega t + phi), inside A cos(omega (t - origin)) + B sin(omega (t - origin)), omega."""
+    """a cos(omega t + phi), inside A cos(omega (t - origin)) + B sin(omega (t - origin)), omega.
+
+    A further entry of the coefficient vector tells by how much its origin is later than that of all phases: where
+    clocks lie far apart a phase counts from what the effect is in, or it hangs on the last digits of the frequency.
+    """
+
+    @property
+    def entries(self) -> int:
+        return self.size + 1
 
     def named(self, values: Values, origin: float) -> dict[str, Any]:
         cosine, sine, omega = np.moveaxis(np.asarray(values), -1, 0)
@@ -328,7 +341,7 @@ def vocabulary(
         effect = force.memory or replace(UNNAMED, amplitudes=len(force.pushes[0]))
         targets = tuple(coordinates[i] for i in force.places)
         listed.append(Candidate(effect, targets, force.places, nameless=force))
-    first = np.cumsum([0, *(one.effect.size + one.effect.switched for one in listed)])
+    first = np.cumsum([0, *(one.effect.entries for one in listed)])
     return tuple(replace(one, first=int(k)) for one, k in zip(listed, first, strict=False))
 
 

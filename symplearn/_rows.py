@@ -15,8 +15,8 @@ from ._thinning import Thinned, thin, thinning_width
 
 # A gap this much wider than the usual one is bridged by rows without readings, so that one substep fits all spans.
 _WIDE = 1.5
-# Rows that a sensor may be late by, and pieces of that time of which each row is told the inputs' means.
-LATEST, _PIECES = 5.0, 20
+# Pieces of the time before a row of which it is told the inputs' means.
+_PIECES = 20
 # Fitted rows of one recording beyond which the first ones are left out; the last ones lead up to the held-out part.
 _LONGEST = 15_000
 
@@ -60,18 +60,17 @@ class Rows:
 
 def lay_out(
     recordings: Sequence[HasRows], holdout: float, width: float, substep: float, is_begun: bool = True,
-    lateness: float | None = None,
+    past: float | None = None,
 ) -> list[Rows]:  # fmt: skip
     """Thin recordings into bins of `width`, split off the held-out parts, and lay spans of at most `substep`.
 
     All recordings get the same number of substeps per span, so that one compiled function serves them all. Where the
     state at the first row is known (`is_begun`), that row stays as it is; where not, the first rows of a recording that
-    holds more than can be fitted in minutes, even after thinning, are left out. With a `lateness`, of sensors that are
-    known to be late, every row knows the inputs that long before it and `LATEST` rows more.
+    holds more than can be fitted in minutes, even after thinning, are left out. Every row knows the inputs of the time
+    `past` before it, which a sensor that is late shows.
     """
     thinned = [_thinned(recording, holdout, width, is_begun) for recording in recordings]
-    usual = max(float(np.median(np.diff(rows.times))) for rows, _ in thinned)
-    pieces, past = math.ceil(usual / substep - 1e-9), None if lateness is None else LATEST * usual + lateness
+    pieces = max(math.ceil(np.median(np.diff(rows.times)) / substep - 1e-9) for rows, _ in thinned)
     return [
         _one(recording, rows, first, max(1, pieces), holdout, past)
         for recording, (rows, first) in zip(recordings, thinned, strict=True)

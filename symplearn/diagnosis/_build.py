@@ -31,6 +31,8 @@ SUBSTEPS = 8
 # to order two, which effects of velocity are stepped to, and of 256 to order four.
 _CHANGE = 0.1
 _SETTLING = 0.1  # of the first change: order one would leave a thousandth after the last halving
+# Rows that a sensor may be late by, and share of a period.
+_LATE, _LATE_BY = 5.0, 0.5
 _BROAD = 3.0  # standard deviations that a known delay may be longer
 _HALVINGS = 6  # the first of them may only keep a stiff motion from being thrown out
 
@@ -110,8 +112,10 @@ def build(
 ) -> Problem:
     """Lay the recordings out and gather every prior."""
     # A prior of the initial state belongs to the first row, which must then stay.
-    averaged, lateness = averaged_over(file, recordings), _lateness(file) if built.delayed else None
-    rows = tuple(lay_out(recordings, holdout, averaged, substep, bool(file.initial), lateness))
+    averaged = averaged_over(file, recordings)
+    latest = max(_latest(r, averaged) for r in recordings)
+    past = latest + _known_lateness(file) if built.delayed else None
+    rows = tuple(lay_out(recordings, holdout, averaged, substep, bool(file.initial), past))
     parameters, known, calibrated = _values(file, built, len(recordings))
     return Problem(
         equations=built,
@@ -128,11 +132,20 @@ def build(
             if c.effect.name in EFFECTS and restriction.allows(c) and _is_open(file, c)
         ),
         units=dict(file.units),
+        latest=latest,
         known_outliers=tuple(j for j, c in enumerate(built.columns) if _has_outliers(file, c)),
     )
 
 
-def _lateness(file: SimulationFile) -> float:
+def _latest(recording: Recording, averaged: float) -> float:
+    """How late a sensor may be: some rows, or a share of the motion's shortest period, of which there may be many."""
+    seen = [recording.times[~np.isnan(column)] for column in recording.readings.T]
+    gaps = [averaged, *(float(np.median(np.diff(times))) for times in seen if len(times) > 1)]
+    frequency = highest_frequency(recording.times, recording.readings)
+    return max(_LATE * max(gaps), _LATE_BY / frequency if frequency > 0 else 0.0)
+
+
+def _known_lateness(file: SimulationFile) -> float:
     """How late sensors may be by what is known of them."""
     known = (quantity for term in file.terms if term.effect == DELAY.name for quantity in term.coefficients.values())
     return sum((abs(one.value) + _BROAD * (0.0 if one.sd is None else one.sd) for one in known), 0.0)

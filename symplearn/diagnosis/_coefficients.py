@@ -23,7 +23,7 @@ def values_of(problem: Problem, estimate: Estimate, member: int) -> dict[str, fl
     if one.effect.amplitudes == 0:
         return dict(_scatter(problem, estimate, one))
     place = dict(problem.placed(estimate.combination))[member]
-    named = one.effect.named(estimate.z[place], problem.equations.origin)
+    named = one.effect.named(estimate.z[place], problem.origin(member))
     return {name: float(value) for name, value in named.items()}
 
 
@@ -41,7 +41,7 @@ def coefficients(
     if one.effect.size == 1:
         return {one.effect.coefficients[0]: _single(problem, estimate, place.start, inflation)}
     draws = _drawn(problem, priors, estimate, place, inflation)
-    named = one.effect.named(draws, problem.equations.origin)
+    named = one.effect.named(draws, problem.origin(member))
     if within_bounds(problem, priors, estimate) is not estimate:  # a step about a fit may end beyond
         values = _in_the_middle(named)
     return {name: _summary(values[name], named[name], circular=name == "phi") for name in values}

@@ -36,7 +36,7 @@ def as_driven(weigher: Weigher, combination: Combination) -> list[Start]:
     for r in own:
         both = [along(problem, force, r, white.z, some, paths[r])[:, one.place] for some in (combination, rest)]
         push.append(both[0] - both[1])
-        times.append(problem.rows[r].times[: len(paths[r])] - problem.equations.origin)
+        times.append(problem.rows[r].times[: len(paths[r])] - problem.origin(instead[0]))
     values = problem.candidate(instead[0]).values.stop - 1
     bounds = weigher.found.priors.lower[values], weigher.found.priors.upper[values]
     z = problem.carried(white.z, combination, driven)

@@ -8,7 +8,6 @@ from jaxtyping import Float
 
 from .. import _effects as effects
 from .._effects import Candidate, Drag, Oscillating, PowerForce
-from .._rows import LATEST
 from ._activity import powers
 from ._calibrate import Priors, even
 from ._memories import Span
@@ -21,6 +20,8 @@ STRENGTH = 0.3
 # A stop bears the forces already there at this share of the motion's range, over `STRENGTH`, or softer: at a ten
 # thousandth. A prior that hard stops do not fit in makes them softer than they are; orders of magnitude cost little.
 _DEPTH = 3e-5
+# Share of the rows that at least lie inside of a stop.
+_RESTING = 0.1
 # Root mean square over the recording of what grows evenly to one, and of what is one in half of it: their inverses.
 _EVEN, _HALF = np.sqrt(3.0), np.sqrt(2.0)
 
@@ -35,7 +36,7 @@ def with_effects(problem: Problem, priors: Priors, motion: Motion) -> Priors:
             loose = _looseness(problem, priors, motion, one.place)
             scales[amplitudes] *= np.hypot(1.0, loose / STRENGTH) * np.hypot(1.0, loose)
         if one.effect is effects.DELAY:
-            upper[one.first] = LATEST * motion.gap
+            scales[one.first], upper[one.first] = problem.latest / 2, problem.latest
         if one.effect.places:
             place = amplitudes.stop
             low, high = _range(motion, one)
@@ -69,7 +70,7 @@ def _unit(motion: Motion, one: Candidate) -> tuple[float, ...]:
     if one.effect.acts_on == effects.COLUMN:
         level = motion.levels[one.place]
         units = {effects.BIAS: level, effects.GAIN: 1.0, effects.DRIFT: _EVEN * level / motion.span}
-        return (units.get(one.effect, LATEST / 2 * motion.gap / STRENGTH),) * one.effect.amplitudes
+        return (units.get(one.effect, 1.0),) * one.effect.amplitudes
     if one.effect.acts_on == effects.PARAMETER:
         later = {effects.DRIFTING: _EVEN / motion.span, effects.REGIME: _HALF}
         return (later.get(one.effect, 1.0),) * one.effect.amplitudes
@@ -93,7 +94,9 @@ def _force_unit(motion: Motion, one: Candidate) -> tuple[float, ...]:
         return (1.0,) * one.effect.amplitudes  # see `with_nameless`
     if one.effect is effects.IMPULSE:
         return (push / motion.own_frequency(i),)
-    return (push,) * 2  # a cosine and a sine, whose root mean squares add in squares
+    # A cosine and a sine, whose root mean squares add in squares. What moves a body as far in a shorter time is the
+    # stronger by the square of their ratio: the middle of all orders of magnitude.
+    return (push * max(1.0, motion.frequencies[1] / motion.own_frequency(i)),) * 2
 
 
 def _pair_unit(motion: Motion, one: Candidate) -> tuple[float, ...]:
@@ -117,8 +120,9 @@ def _range(motion: Motion, one: Candidate) -> tuple[float, float]:
         low, high = motion.frequencies
         return low / 2, high
     if one.effect is effects.STOP:
-        low, middle, high = np.nanquantile(motion.q[:, one.place], [0.0, 0.5, 1.0])
-        return (float(middle), float(high)) if one.side == "upper" else (float(low), float(middle))
+        # One that a body comes to rest on lies beyond most of what is read.
+        low, least, most, high = np.nanquantile(motion.q[:, one.place], [0.0, _RESTING, 1.0 - _RESTING, 1.0])
+        return (float(least), float(high)) if one.side == "upper" else (float(low), float(most))
     return motion.first, motion.last
 
 

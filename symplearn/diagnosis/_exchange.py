@@ -201,6 +201,7 @@ def _further(stepper: Stepper, fits: Fits, rows: Sequence[int], units: dict[int,
                 for member in several[unit]:
                     which = problem.members[member].recordings
                     columns = np.concatenate([x * (r in which) for r, x in enumerate(by_run)], axis=1)
+                    columns = problem.turned(member, unit.place, columns)
                     values = np.append(np.zeros(len(at)), [] if unit.place is None else [unit.place])
                     found.append(Response(member, values, columns))
     return found

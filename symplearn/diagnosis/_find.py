@@ -12,6 +12,7 @@ from ._ahead import look_ahead
 from ._build import augmented_equations, build, first_substep, refined, rows_fitted
 from ._found import Found, doubtful_outliers, speaker
 from ._lasting import total_noise
+from ._late import without_the_time_before
 from ._nameless import is_clear, weigh_nameless
 from ._null_paths import rough_noise
 from ._options import Options
@@ -23,15 +24,44 @@ from ._usable import check_columns, check_fitted, check_motion, check_searched, 
 
 # Third differences show the noise and some of the motion: the share of them that counts as noise at least.
 _ROUGH = 0.3
+# How often a search begins, at most, without what was found to be of another time.
+_ANEW = 3
 
 
 def searched(
     file: SimulationFile, recordings: Sequence[Recording], options: Options, deadline: float
-) -> tuple[Found, Stepper]:
-    """Lay the problem out with substeps that are fine enough, and search; once more where what is found needs finer.
+) -> tuple[Found, Stepper, list[str]]:
+    """Lay the problem out with substeps that are fine enough, and search; once more where what is found needs finer,
+    or shows readings to be of another time, which is told in sentences.
 
     `InputError` where there is nothing to fit, to search or to step.
     """
+    told: dict[str, None] = {}
+    for _ in range(_ANEW):
+        search, rebuild, steps = _begun(file, recordings, options, deadline)
+        if not search.found.complete:
+            break
+        shown, why = without_the_time_before(search.stepper, search.found, recordings)
+        if not why:
+            break
+        options.progress("searching once more without what late sensors show of the time before")
+        recordings, told = shown, told | dict.fromkeys(why)
+    weigh_nameless(file, recordings, options, search, steps[0])
+    likeliest = max(search.found.estimates, key=search.found.odds)
+    if any(search.problem.candidate(m).nameless for m in likeliest):  # its shape may pass faster than the motion
+        steps = _refined(search, lambda longest: rebuild(longest, search.problem.equations), steps, options)
+    search.settle()
+    found = search.found
+    options.progress("comparing how well answers predict ahead")
+    look_ahead(search.stepper, found, search.rows)
+    found.is_fine = steps[1]
+    return found, search.stepper, list(told)
+
+
+def _begun(
+    file: SimulationFile, recordings: Sequence[Recording], options: Options, deadline: float
+) -> tuple[Search, Callable[..., Problem], tuple[float, bool]]:
+    """The search for names, what lays its problem out anew, and its longest substep with whether that is fine."""
     check_steps(file, recordings)
     first, middle = float(recordings[0].times[0]), float(np.mean(recordings[0].times[[0, -1]]))
     built = augmented_equations(file, first, options.restriction, middle)
@@ -53,17 +83,7 @@ def searched(
     finer, substep, is_fine = refined(rebuild, problem, seeds.z[0], noise, substep)
     stepper = stepper if finer is problem else Stepper(finer, options.jobs)
     search = _run(stepper, seeds.z, deadline, options)
-    steps = _refined(search, rebuild, (substep, is_fine), options)
-    weigh_nameless(file, recordings, options, search, steps[0])
-    likeliest = max(search.found.estimates, key=search.found.odds)
-    if any(search.problem.candidate(m).nameless for m in likeliest):  # its shape may pass faster than the motion
-        steps = _refined(search, lambda longest: rebuild(longest, search.problem.equations), steps, options)
-    search.settle()
-    found = search.found
-    options.progress("comparing how well answers predict ahead")
-    look_ahead(search.stepper, found, search.rows)
-    found.is_fine = steps[1]
-    return found, search.stepper
+    return search, rebuild, _refined(search, rebuild, (substep, is_fine), options)
 
 
 def _refined(

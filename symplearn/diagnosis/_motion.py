@@ -7,11 +7,14 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
+from .._thinning import highest_frequency
 from ._along import along_all, force, parts, readings, velocity
 from ._problem import Problem
 
 # Of a parameter's own size, for the derivative of a force that hangs on it smoothly.
 _STEP = 1e-6
+# Share of the Nyquist frequency up to which oscillations are tried, and of the highest that is read.
+_NYQUIST, _ABOVE = 0.9, 1.1
 
 
 def rms(values: np.ndarray) -> float:
@@ -44,6 +47,7 @@ class Motion:
     stiffening: Float[np.ndarray, "d parameter"] = field(default_factory=lambda: np.zeros((1, 0)))
     # Power that forces which turn round with the motion feed into each coordinate, by row.
     turning: Float[np.ndarray, "row d"] = field(default_factory=lambda: np.zeros((0, 1)))
+    highest: float = 0.0  # frequency that stands out of the noise of a reading, in rad/time
 
     @property
     def first(self) -> float:
@@ -60,7 +64,8 @@ class Motion:
 
     @property
     def span(self) -> float:
-        return self.last - self.first
+        """Of the longest recording; their clocks may begin far apart."""
+        return max(float(t[-1] - t[0]) for t in self.times)
 
     @cached_property
     def gap(self) -> float:
@@ -69,8 +74,9 @@ class Motion:
 
     @property
     def frequencies(self) -> tuple[float, float]:
-        """From one cycle in the recording to half the Nyquist frequency, in rad/time."""
-        return 2 * np.pi / self.span, max(np.pi / (2 * self.gap), 2 * np.pi / self.span)
+        """From one cycle in the recording to half the Nyquist frequency, or the highest that is read, in rad/time."""
+        highest = np.clip(_ABOVE * self.highest, np.pi / (2 * self.gap), _NYQUIST * np.pi / self.gap)
+        return 2 * np.pi / self.span, max(float(highest), 2 * np.pi / self.span)
 
     def own_frequency(self, i: int) -> float:
         """Typical frequency of one coordinate's motion, in rad/time."""
@@ -85,14 +91,18 @@ def motion_along(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarr
     turning = 0.5 * (push - along_all(problem, force, z, back))[:, :d] * v[:, :d]
     p, span = np.concatenate(paths)[:, problem.equations.momentum], max(np.ptp(r.times) for r in problem.rows)
     own = [each[:, np.equal(problem.equations.pushed, i)] for i in range(d)]
+    times = tuple(r.times[: len(path)] for r, path in zip(problem.rows, paths, strict=True))
+    there = [_there(push[:, i], own[i], rms(p[:, i]) / span) for i in range(d)]
+    needed = _needed([path[:, problem.equations.momentum] for path in paths], times)
     return Motion(
         q=np.concatenate([path[:, :d] for path in paths]),
         v=v[:, :d],
-        forces=np.array([_there(push[:, i], own[i], rms(p[:, i]) / span) for i in range(d)]),
+        forces=np.fmax(there, needed),
         levels=np.array([rms(column) for column in shown.T]),
-        times=tuple(r.times[: len(path)] for r, path in zip(problem.rows, paths, strict=True)),
+        times=times,
         stiffening=stiffening(problem, z, paths),
         turning=turning,
+        highest=2 * np.pi * max(highest_frequency(r.times, r.readings) for r in problem.rows),
     )
 
 
@@ -102,6 +112,15 @@ def _there(push: Float[np.ndarray, " row"], parts: Float[np.ndarray, "row part"]
     apart = sum(_mean_square(one) for one in (push - parts.sum(1), *parts.T))
     square = max(_mean_square(push), apart)
     return float(np.sqrt(square)) if square > 0 else stop
+
+
+def _needed(
+    momenta: Sequence[Float[np.ndarray, "_ d"]], times: Sequence[Float[np.ndarray, " _"]]
+) -> Float[np.ndarray, " d"]:
+    """Root mean square of the forces that momenta need to change as they do, whatever exerts them."""
+    gaps = np.concatenate([np.diff(t) for t in times])
+    squares = np.concatenate([np.diff(p, axis=0) ** 2 for p in momenta]) / gaps[:, None]
+    return np.sqrt(squares.sum(0) / gaps.sum())
 
 
 def stiffening(

@@ -4,6 +4,7 @@ The unknowns of one combination of effects are one vector z = [x_0 of every reco
 A slot holds one value of an effect of the combination; which effect is data, so that nothing is compiled anew.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,10 +15,11 @@ from jaxtyping import Bool, Float, Int
 import integrators as ig
 
 from .._augmented import Equations
-from .._effects import HIDDEN, NOISE, Candidate
+from .._effects import HIDDEN, NOISE, Candidate, Oscillating
 from .._rows import Rows
 
 MOST = 3  # effects in the largest combination
+_FEW = 4  # recordings of which an effect may be in any
 SLOTS = 9  # values of the largest combination: three of three each
 
 # Numbers of members of a problem, in increasing order: effects on targets, in all recordings or in some.
@@ -75,6 +77,7 @@ class Problem:
     noise: Float[np.ndarray, " channel"]  # sd of one original reading, nan where it is estimated
     searched: tuple[int, ...]  # members that may be reported and are in all recordings
     units: dict[str, str]
+    latest: float  # how late a sensor may be
     known_outliers: tuple[int, ...] = ()  # columns whose outliers the file knows of
 
     @cached_property
@@ -103,10 +106,11 @@ class Problem:
 
     @cached_property
     def members(self) -> tuple[Member, ...]:
-        """Every effect on every target: in all recordings, and after those in some of them only."""
+        """Every effect on every target: in all recordings, and after those in some of them only: of more than a few
+        in one, or in all but one."""
         every = tuple(range(len(self.rows)))
-        some: list[tuple[int, ...]] = [(r,) for r in every] if len(every) > 1 else []
-        some += [every[:r] + every[r + 1 :] for r in every] if len(every) > 2 else []
+        sizes = range(1, len(every)) if len(every) <= _FEW else (1, len(every) - 1)
+        some = [which for size in sizes for which in itertools.combinations(every, size)]
         candidates = self.equations.candidates
         return tuple(Member(c, which) for which in (every, *some) for c in candidates)
 
@@ -171,7 +175,24 @@ class Problem:
                 matrix[rows, np.arange(one.values.start, one.values.stop)] = 1.0
                 if one.effect.switched:
                     matrix[-1, one.values.stop] = 1.0
+                if isinstance(one.effect, Oscillating):
+                    matrix[-1, one.values.stop] = self.origin(member) - self.equations.origin
         return matrix
+
+    def turned(
+        self, member: int, place: float | None, amplitudes: Float[np.ndarray, "amplitude ..."]
+    ) -> Float[np.ndarray, "amplitude ..."]:
+        """Amplitudes at a frequency, or what they do, whose phase counts from the member's own origin, by those that
+        count from that of all; as they are where there is no phase."""
+        if place is None or not isinstance(self.candidate(member).effect, Oscillating):
+            return amplitudes
+        angle = place * (self.origin(member) - self.equations.origin)
+        return np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]) @ amplitudes
+
+    def origin(self, member: int) -> float:
+        """From when the phase of an effect counts inside: the middle of the first recording that has it."""
+        first = self.members[member].recordings[0]
+        return float(np.mean(self.rows[first].times[[0, -1]])) if first else self.equations.origin
 
     def active(self, combination: Sequence[int]) -> Bool[np.ndarray, " z"]:
         """Which entries of z are free under a combination."""

@@ -216,6 +216,7 @@ def _unseen_strengths(
 
 def placed(problem, z, combination, larger, member, amplitudes, unit: Unit) -> np.ndarray:
     """Unknowns and old effects as they are in z, and the new effect of given amplitudes at the unit's place."""
-    out = problem.carried(z, combination, larger)
+    out, number = problem.carried(z, combination, larger), problem.candidate(member).effect.amplitudes
+    amplitudes = np.append(problem.turned(member, unit.place, amplitudes[:number]), amplitudes[number:])
     out[dict(problem.placed(larger))[member]] = np.append(amplitudes, [] if unit.place is None else [unit.place])
     return np.asarray(out)

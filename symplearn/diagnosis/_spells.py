@@ -26,8 +26,9 @@ _STEPS, _HOPELESS = 4, 50.0
 
 
 class Spells:
-    """Weighs forces that act for a while: beside nothing, beside the best combination, and, where nothing with one is
-    near the best, beside the single effects that promise most along its path."""
+    """Weighs forces that act for a while: beside nothing, beside the best combination and what it is without one of its
+    members, and, where nothing with one is near the best, beside the single effects that promise most along its path.
+    """
 
     def __init__(self, prospects: Prospects, typical: Float[np.ndarray, " d"]):
         self.prospects, self.typical = prospects, typical
@@ -38,6 +39,7 @@ class Spells:
         w = self.weigher
         pulls = [pull for c in dict.fromkeys([w.base, best]) if (pull := w.found.of(c, "force"))]
         fits = self._add([start for pull in pulls for start in self._about(pull)])
+        self._add(self._with_less([fit for fit in fits if fit.combination == best]))
         alone = [fit for fit in fits if fit.combination == w.base and np.isfinite(fit.log_evidence)]
         if not alone or w.found.odds(w.base) < w.found.odds(best) - reach:
             return
@@ -48,6 +50,16 @@ class Spells:
         ranked = [one.combination for one in likely if w.found.of(one.combination, "spell")]
         ranked.sort(key=w.found.odds, reverse=True)
         self._add([start for c in ranked[:_OWN] if (own := w.found.of(c, "spell")) for start in self._about(own)])
+
+    def _with_less(self, fits: list[PathFit]) -> list[PathFit]:
+        """The best of some fits with a member less beside the same force, which may do what that was needed for."""
+        some = [fit for fit in fits if np.isfinite(fit.log_evidence)]
+        if not some:
+            return []
+        path, w = max(some, key=lambda fit: fit.log_evidence - fit.choices), self.weigher
+        less = [tuple(m for m in path.combination if m != out) for out in path.combination if out not in w.base]
+        return [replace(path, combination=c, z=w.problem.carried(path.z, path.combination, c), laplace=None)
+                for c in less if c != w.base and w.found.of(c, "white")]  # fmt: skip
 
     def _about(self, pull: Estimate) -> list[PathFit]:
         return spells(self.weigher.stepper, pull, self.typical, self.weigher.rows)

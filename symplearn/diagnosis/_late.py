@@ -1,0 +1,67 @@
+"""What a late sensor shows first is of the time before its recording: nobody knows what drove the motion then."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .._effects import DELAY
+from .._recording import Recording
+from ._found import Found
+from ._problem import Problem
+from ._stochastic import free_run
+from ._trajectory import Stepper
+from ._weighed import Estimate
+
+# Standard deviations that a sensor may be later than it was found to be.
+_BROAD = 3.0
+# How far off, in sd of the noise, what a late sensor shows first may be where no input drives the motion.
+_OFF = 2.0
+
+
+def without_the_time_before(
+    stepper: Stepper, found: Found, recordings: Sequence[Recording]
+) -> tuple[list[Recording], list[str]]:
+    """The recordings without what sensors that are late, by the likeliest answer, showed of the time before them, and
+    what was left out, in sentences; as they are where that is how the motion would have been."""
+    e = found.of(max(found.estimates, key=found.odds), "white")
+    if e is None or not np.isfinite(e.log_evidence):
+        return list(recordings), []
+    late = [_latest(stepper.problem, e, r) for r in range(len(recordings))]
+    hidden = [_before(one, delay) for one, delay in zip(recordings, late, strict=True)]
+    number = sum(one.sum(0) for one in hidden)
+    if not np.any(number) or not (stepper.problem.equations.inputs or _is_off(stepper, e, late)):
+        return list(recordings), []
+    out = [replace(one, readings=np.where(some, np.nan, one.readings))
+           for one, some in zip(recordings, hidden, strict=True)]  # fmt: skip
+    told = [f"the sensor of {column} is late: its first readings, {n} in all, show the time before the recording and "
+            "were left out" for column, n in zip(recordings[0].columns, np.asarray(number).tolist(), strict=True)
+            if n]  # fmt: skip
+    return out, told
+
+
+def _before(recording: Recording, late: Float[np.ndarray, " channel"]) -> Bool[np.ndarray, "time channel"]:
+    """Readings of the time before the first row."""
+    return (recording.times[:, None] < recording.times[0] + late) & ~np.isnan(recording.readings)
+
+
+def _latest(problem: Problem, e: Estimate, recording: int) -> Float[np.ndarray, " channel"]:
+    """How late each sensor may be in a recording, by what is known and what was found."""
+    late = problem.coefficients(recording, e.z, e.combination)[problem.equations.firsts(DELAY)]
+    for member, place in problem.placed(e.combination):
+        own = problem.members[member]
+        if own.candidate.effect is DELAY and recording in own.recordings:
+            late[own.candidate.place] += _BROAD * np.sqrt(e.covariance[place.start, place.start])
+    return late
+
+
+def _is_off(stepper: Stepper, e: Estimate, late: Sequence[Float[np.ndarray, " channel"]]) -> bool:
+    """Whether what sensors show first is not how the motion would have been before, as of a body that was let go."""
+    problem, square, number = stepper.problem, 0.0, 0
+    for r, (rows, course, delay) in enumerate(zip(problem.rows, stepper.courses, late, strict=True)):
+        shown, _ = free_run(problem, course, e.z, e.combination, r, e.z[r * problem.state :][: problem.state], 0)
+        first = (rows.times[:, None] < rows.times[0] + delay) & ~np.isnan(rows.readings)
+        errors = ((rows.readings - shown) / e.noise)[first]
+        square, number = square + float((errors**2).sum()), number + len(errors)
+    return square > _OFF**2 * number
