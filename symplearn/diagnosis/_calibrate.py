@@ -19,6 +19,8 @@ _FLOOR = 1e-9
 _FLAT = 1e-13
 # Of minus twice the log posterior: what a fit may still promise that is as good as done.
 _SLIGHT = 1.0
+# Starts that are smaller than this share of the motion, as of what rests at first, are as likely as one of that size.
+_AT_REST = 0.03
 # After this many steps a lane that lies this many nats behind the best is no longer improved, unless that has fallen to
 # this share in so many of them.
 _PATIENCE, _HOPELESS = 6, 500.0
@@ -35,7 +37,7 @@ class Priors:
     `centres` and `scales` are by entry of the coefficient vector; `unseen` is the prior sd of the start of an unseen
     oscillator, by the coordinate that it hangs on. `lower` and `upper` bound where an effect may be placed, by entry of
     the coefficient vector; `windows`, where given, from when to when every recording is read, in which alone something
-    may happen at once.
+    may happen at once; `sizes`, where given, how large the motion is in every direction that a start is unknown in.
     """
 
     mean: Float[np.ndarray, " z"]
@@ -47,11 +49,22 @@ class Priors:
     unseen: Float[np.ndarray, "coordinate 2"]
     powers: Any = None  # `Powers` of the frictions along the motion
     windows: Float[np.ndarray, "recording 2"] | None = None
+    sizes: Float[np.ndarray, " state"] | None = None  # infinite where the start is known
 
     def widths(self, problem: Problem) -> Float[np.ndarray, " parameter"]:
         """Standard deviations of the calibrated parameters; 0 where nothing gives a size."""
         precision = self.precision[problem.head : problem.head + problem.calibrated.parameters]
         return np.where(precision > 0, precision, np.inf) ** -0.5
+
+    def log_size(self, problem: Problem, z: Float[np.ndarray, " z"]) -> float:
+        """Log prior density, up to a constant, of how large unknown starts are: of any order of magnitude. A flat one
+        would favour what makes a motion larger, as a gain that makes its readings smaller, by the volume that is left
+        to its start."""
+        if self.sizes is None or not np.isfinite(self.sizes).any():
+            return 0.0
+        some = np.isfinite(self.sizes)
+        starts = z[: problem.head].reshape(len(problem.rows), problem.state)[:, some] / self.sizes[some]
+        return float(-0.5 * some.sum() * np.log(_AT_REST**2 + (starts**2).mean(1)).sum())
 
     def precision_of(self, problem: Problem, combination: Combination) -> Float[np.ndarray, " z"]:
         """Prior precisions with the entries of a combination filled in."""

@@ -18,7 +18,7 @@ _APART = 2.0
 # Outliers are larger than this many times the noise.
 _FAR = 3.0
 # Nats that an estimate which did not converge must be ahead to be reported nevertheless.
-_UNCONVERGED = 3.0
+UNCONVERGED = 3.0
 # Directions of a covariance below this share of its longest are round-off.
 _FLATTEST = 1e-12
 
@@ -35,7 +35,7 @@ class Ahead:
 
 def speaker(estimates: Sequence[Estimate]) -> Estimate:
     """The estimate of the best kind of remainder; one that converged is preferred to one barely ahead that did not."""
-    return max(estimates, key=lambda e: e.log_evidence - (0.0 if e.converged else _UNCONVERGED))
+    return max(estimates, key=lambda e: e.log_evidence - (0.0 if e.converged else UNCONVERGED))
 
 
 def doubtful_outliers(problem: Problem, taken_out: Combination, best: Estimate) -> frozenset[int]:
@@ -102,7 +102,7 @@ class Found:
         elif np.isfinite(one.log_evidence):
             modes.append(one)
         top = max(mode.log_evidence for mode in modes)
-        lead = _UNCONVERGED * (int(old.converged) - int(new.converged))
+        lead = UNCONVERGED * (int(old.converged) - int(new.converged))
         better = new if one.log_evidence >= max(mode.log_evidence for mode in old.modes) + lead else old
         total = float(logsumexp([mode.log_evidence for mode in modes])) if np.isfinite(top) else -np.inf
         return replace(better, log_evidence=total, modes=tuple(modes))

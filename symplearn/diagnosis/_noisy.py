@@ -185,9 +185,10 @@ def _integrated(problem: Problem, fit: PathFit, passes, priors: Priors, weight) 
     if not np.isfinite(gram).all():
         return Laplace(-np.inf, np.zeros(problem.size), np.zeros((problem.size, problem.size)), 0.0)
     precision = priors.precision_of(problem, fit.combination)
-    return laplace(gram, offset, fit.z, priors.mean_of(problem, fit.combination), precision,
-                   problem.active(fit.combination), problem.lower_bounds(fit.combination),
-                   priors.bounds_of(problem, fit.combination))  # fmt: skip
+    one = laplace(gram, offset, fit.z, priors.mean_of(problem, fit.combination), precision,
+                  problem.active(fit.combination), problem.lower_bounds(fit.combination),
+                  priors.bounds_of(problem, fit.combination))  # fmt: skip
+    return replace(one, log_evidence=one.log_evidence + priors.log_size(problem, fit.z))
 
 
 def lane_grams(

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from .._effects import GAIN, HIDDEN, REGIME, Memory, Oscillating
 from ._constant import constant_evidence
-from ._found import Found, speaker
+from ._found import UNCONVERGED, Found, speaker
 from ._own_period import in_tune
 from ._problem import Combination, Problem
 from ._static import LARGEST
@@ -88,12 +88,10 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
             evidences[combination] = max(plain, noisy - np.log(remainder))
             continue
         total = evidences[combination] = float(np.logaddexp(plain + np.log(1.0 - _BESIDE), noisy))
-        if (
-            any(e.converged for e in estimates)
-            and _informed(problem, found, combination)
-            and not _is_remainder(problem, found, combination)
-        ):
-            price = found.prices.log(combination)
+        if _informed(problem, found, combination) and not _is_remainder(problem, found, combination):
+            # What no fit of came to its end, as where a time stops between two rows, may have less than it was given.
+            doubt = 0.0 if any(e.converged for e in estimates) else UNCONVERGED
+            price = found.prices.log(combination) - doubt
             # What explains less than it leaves, and was not seen to predict anything, is not what was left out.
             if found.ahead and not _predicts(problem, found, combination):
                 other = float(np.logaddexp(other, price + doubtful))

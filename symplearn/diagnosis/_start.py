@@ -52,7 +52,7 @@ def with_states(problem: Problem, priors: Priors, paths: Sequence[Float[np.ndarr
     size = np.array([rms(column) for column in np.concatenate(paths).T])
     unknown = np.tile(np.isinf(problem.initial.sd), len(problem.rows))
     precision[: problem.head][unknown] = (_WIDE * np.tile(size, len(problem.rows))[unknown]) ** -2.0
-    return replace(priors, precision=precision)
+    return replace(priors, precision=precision, sizes=np.where(np.isinf(problem.initial.sd), size, np.inf))
 
 
 def windows(rows: Sequence[int], fractions: Sequence[float], least: int) -> list[list[int]]:

@@ -251,7 +251,8 @@ def _laplace(problem: Problem, combination: Combination, gram, offset: float, z,
     precision = priors.precision_of(problem, combination)
     active, lower = problem.active(combination), problem.lower_bounds(combination)
     bounds = priors.bounds_of(problem, combination)
-    return laplace(gram, offset, z, priors.mean_of(problem, combination), precision, active, lower, bounds)
+    one = laplace(gram, offset, z, priors.mean_of(problem, combination), precision, active, lower, bounds)
+    return replace(one, log_evidence=one.log_evidence + priors.log_size(problem, z))
 
 
 def standardised(r: list[np.ndarray], weight: list[np.ndarray], noise: np.ndarray) -> Float[np.ndarray, "row channel"]:
