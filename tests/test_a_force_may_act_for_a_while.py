@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 from symplearn.diagnosis import Options, diagnose
+from symplearn.diagnosis._effect_priors import with_effects
 from symplearn.diagnosis._found import Found
 from symplearn.diagnosis._locate import strained_when
+from symplearn.diagnosis._motion import motion_along
 from symplearn.diagnosis._noisy import PathFit, fit_paths
 from symplearn.diagnosis._outlook import Outlook
 from symplearn.diagnosis._prospects import Prospects
+from symplearn.diagnosis._score import Start
 from symplearn.diagnosis._spells import Spells, spells
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
@@ -111,6 +114,28 @@ def test_what_cannot_come_near_the_best_is_given_up(weighed):
     assert sum(other.may_matter(fit, 50.0) for fit in fits) in range(1, len(fits) + 1)
     other.found.add(replace(full, kind="white", log_evidence=full.log_evidence + 200.0))
     assert not any(other.may_matter(fit, 50.0) for fit in fits)
+
+
+def test_what_a_spell_does_needs_no_effect_beside_it(weighed):
+    """A blow that was told with a damping, where a force that acts for a while does its work: the damping alone gets
+    the same force, and is ahead of both."""
+    weigher, starts = weighed
+    p, found = weigher.problem, weigher.found
+    drag, blow = (next(m for m in p.searched if p.candidate(m).key == (effect, ("q",)))
+                  for effect in ("viscous_damping", "impulse"))  # fmt: skip
+    priors = with_effects(p, found.priors, motion_along(p, starts[0].z, starts[0].paths))
+    other = Weigher(weigher.stepper, Found(p, priors))
+    both = tuple(sorted((drag, blow)))
+    for c in ((), (drag,), both):
+        z = p.carried(starts[0].z, (), c)
+        if blow in c:
+            z[dict(p.placed(c))[blow].stop - 1] = 9.0
+        other.weigh([Start(c, z, 0.0)], whole=True)
+    z, first = other.found.of(both, "white").z, starts[0]
+    always = [PathFit(both, np.array([q]), z, first.noise, first.paths) for q in (1e-4, 1e-3, 1e-2)]
+    other.add_paths(fit_paths(other.stepper, always, priors, other.rows, 20))
+    Spells(Prospects(other), np.array([0.7])).weigh(both, 1e9)
+    assert other.found.of((drag,), "spell").log_evidence > other.found.of(both, "spell").log_evidence
 
 
 def test_a_calm_recording_gains_nothing_by_it(weighed):

@@ -6,10 +6,13 @@ import engine_cases as cases
 import numpy as np
 import pytest
 
-from symplearn.diagnosis._effect_priors import _unit, with_effects
+from symplearn.diagnosis._course import courses
+from symplearn.diagnosis._effect_priors import _range, _unit, with_effects
 from symplearn.diagnosis._motion import Motion, motion_along
 from symplearn.diagnosis._scan import grid
+from symplearn.diagnosis._score import Unit, placed
 from symplearn.diagnosis._start import priors_without_effects
+from symplearn.diagnosis._stochastic import free_run
 
 T = np.linspace(0.0, 20.0, 401)
 Q = np.stack([1.3 * np.cos(T), 0.4 * np.sin(1.7 * T + 0.3)], axis=1)
@@ -95,9 +98,77 @@ def test_nothing_is_looked_for_between_recordings():
     assert np.ptp(np.diff(first)) < 1e-9 and np.diff(first)[0] == pytest.approx(np.diff(second)[0])
 
 
+@pytest.mark.parametrize("effect", ["sensor_drift", "parameter_drift"])
+def test_how_fast_something_drifts_is_told_by_a_recording_alone(effect):
+    """A drift may be as fast as one that shows in a recording, however long after it the next one begins."""
+    scales = []
+    for clock in (0.0, 500.0, 1e5):
+        problem = pair(clocks=(0.0, clock))
+        one = next(c for c in problem.equations.candidates if c.effect.name == effect)
+        scales.append(priors_of(problem).scales[one.first])
+    assert scales == pytest.approx([scales[0]] * 3)
+
+
+@pytest.mark.parametrize("clock", [0.0, 500.0, 1e5])
+def test_a_phase_counts_from_what_the_force_is_in(clock):
+    """What a force in the second recording does is scanned by the phase that all have and fitted by its own: the same
+    force, by the contract's names, and SciPy's motion under it, however far its clock begins from the other's."""
+    problem, omega = pair(clocks=(0.0, clock)), 2.3
+    m = next(m for m, one in enumerate(problem.members)
+             if one.candidate.key == ("periodic_forcing", ("q1",)) and one.recordings == (1,))  # fmt: skip
+    effect, whole, z = problem.candidate(m).effect, problem.whole(m), np.zeros(problem.size)
+    sizes = np.array([0.3, -0.2])
+    z = placed(problem, z, (), (m,), m, sizes, Unit(whole, omega))
+    assert problem.origin(m) == pytest.approx(clock + 10.0) and problem.origin(whole) == problem.equations.origin
+    by_all = effect.named(np.append(sizes, omega), problem.equations.origin)
+    by_own = effect.named(z[dict(problem.placed((m,)))[m]], problem.origin(m))
+    assert by_own["a"] == pytest.approx(by_all["a"])
+    # Round-off of a phase of 2.3e5.
+    assert np.cos(by_own["phi"] - by_all["phi"]) == pytest.approx(1.0, abs=1e-9)
+    force = lambda t: by_all["a"] * np.cos(omega * t + by_all["phi"])  # noqa: E731
+    rates = lambda t, x: [x[2], x[3], -x[0] + force(t), -3.0 * x[1]]  # noqa: E731
+    expected = cases.solved(rates, np.zeros(4), T + clock)[:, 0]
+    shown, _ = free_run(problem, courses(problem)[1], z, (m,), 1, np.zeros(problem.state), 0)
+    # A method of order four in steps of a 126th of the period. Seen: 3e-6.
+    np.testing.assert_allclose(shown[:, 0], expected, atol=1e-4)
+    assert np.abs(expected).max() > 0.1
+
+
 def test_frequencies_are_told_apart_as_one_recording_tells_them():
     """Where clocks lie so far apart that all together resolve more than can be tried, places stay evenly spaced."""
     problem = pair(clocks=(0.0, 1e4))
     whole = problem.whole(member(problem, "periodic_forcing", (0,)))
     tried = np.sort([unit.place for unit in grid(problem, priors_of(problem), whole)])
     assert np.diff(tried).max() < 2 * np.pi / 20 and tried[-1] == pytest.approx(np.pi / (2 * 0.05))
+
+
+@pytest.mark.parametrize(("omega", "least"), [(1.0, 10.0), (16.0, 16.0), (19.5, 18.0)])
+def test_a_frequency_that_is_read_is_tried(omega, least):
+    """Oscillations are tried up to half the Nyquist frequency, here 10.5, and up to what stands out of the readings,
+    but for the last tenth below the Nyquist frequency itself."""
+    times = 0.15 * np.arange(200)
+    file = cases.simulation("p**2/2 + q**2/2")
+    problem = cases.problem(file, [cases.recorded(times, np.cos(omega * times))], 0.05)
+    motion = motion_along(problem, np.zeros(problem.size), [np.ones((200, problem.state))])
+    assert least < motion.frequencies[1] <= 0.9 * np.pi / 0.15 + 1e-9
+    assert omega > 10 or motion.frequencies[1] == pytest.approx(np.pi / 0.3)
+
+
+def test_a_force_may_be_as_strong_as_what_moves_a_body_so_fast():
+    """A force of high frequency moves a body as little as its square is large: its prior reaches the middle of the
+    orders of magnitude in between; that of a constant force does not hang on frequencies."""
+    fast = replace(MOTION, highest=30.0)
+    (push, _), (slow, _) = (_unit(m, candidate(pair(), "periodic_forcing", "q1")) for m in (fast, MOTION))
+    assert push / MOTION.forces[0] == pytest.approx(33.0 / MOTION.own_frequency(0)) and push >= slow
+    (steady,), (same,) = (_unit(m, candidate(pair(), "constant_force", "q1")) for m in (fast, MOTION))
+    assert steady == same
+
+
+def test_a_stop_may_lie_where_a_body_comes_to_rest():
+    """A floor that a ball lies on in four rows of five is above most of where it is read."""
+    q = Q.copy()
+    q[80:, 0] = -0.01
+    q[:80, 0] = np.abs(q[:80, 0])
+    floor = next(c for c in pair().equations.candidates if c.key[0] == "contact_stop" and c.side == "lower")
+    low, high = _range(replace(MOTION, q=q), floor)
+    assert low == pytest.approx(-0.01) and high > 0.1

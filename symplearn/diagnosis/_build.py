@@ -114,7 +114,7 @@ def build(
     # A prior of the initial state belongs to the first row, which must then stay.
     averaged = averaged_over(file, recordings)
     latest = max(_latest(r, averaged) for r in recordings)
-    past = latest + _known_lateness(file) if built.delayed else None
+    past = _aligned(latest + _known_lateness(file), recordings) if built.delayed else None
     rows = tuple(lay_out(recordings, holdout, averaged, substep, bool(file.initial), past))
     parameters, known, calibrated = _values(file, built, len(recordings))
     return Problem(
@@ -143,6 +143,12 @@ def _latest(recording: Recording, averaged: float) -> float:
     gaps = [averaged, *(float(np.median(np.diff(times))) for times in seen if len(times) > 1)]
     frequency = highest_frequency(recording.times, recording.readings)
     return max(_LATE * max(gaps), _LATE_BY / frequency if frequency > 0 else 0.0)
+
+
+def _aligned(past: float, recordings: Sequence[Recording]) -> float:
+    """At least a time of which every piece begins where a row does, or rows do where pieces begin."""
+    shortest = _LATE * min(float(np.median(np.diff(r.times))) for r in recordings)
+    return float(shortest * 2.0 ** max(0.0, np.ceil(np.log2(past / shortest) - 1e-9)))
 
 
 def _known_lateness(file: SimulationFile) -> float:
