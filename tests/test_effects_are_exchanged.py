@@ -87,7 +87,7 @@ def evidence(y, columns, widths):
 
 def any_strength(y, names):
     """The same with each effect of any order of magnitude: from four standard errors to the largest, equally likely,
-    each density times the square of the strength."""
+    each density times the squares of their strengths, which hang together (Isserlis 1918)."""
     columns = [column for name in names for column in COLUMNS[name]]
     own = np.repeat(np.arange(len(names)), [len(COLUMNS[name]) for name in names])
     covariance = evidence(y, columns, SCALE + 0 * own)[1] / SCALE**2
@@ -98,8 +98,13 @@ def any_strength(y, names):
     each = []
     for widths in itertools.product(*shares):
         value, covariance, z = evidence(y, columns, SCALE * np.array(widths)[own])
-        square = (z[3:] ** 2 + np.diag(covariance)) / (SCALE * np.array(widths)[own]) ** 2
-        each.append(value + sum(np.log(square[own == k].mean()) for k in range(len(names))))
+        unit = SCALE * np.array(widths)[own] * np.sqrt(np.bincount(own)[own])
+        mean, spread = z[3:] / unit, covariance / np.outer(unit, unit)
+        square = np.prod([(mean[own == k] ** 2 + np.diag(spread)[own == k]).sum() for k in range(len(names))])
+        if len(names) == 2:
+            cross = spread[np.ix_(own == 0, own == 1)]
+            square += 2 * (cross**2).sum() + 4 * mean[own == 0] @ cross @ mean[own == 1]
+        each.append(value + np.log(square))
     return logsumexp(each) - np.log(len(each))
 
 

@@ -157,11 +157,14 @@ def test_a_frequency_that_is_read_is_tried(omega, least):
 def test_a_force_may_be_as_strong_as_what_moves_a_body_so_fast():
     """A force of high frequency moves a body as little as its square is large: its prior reaches the middle of the
     orders of magnitude in between; that of a constant force does not hang on frequencies."""
-    fast = replace(MOTION, highest=30.0)
-    (push, _), (slow, _) = (_unit(m, candidate(pair(), "periodic_forcing", "q1")) for m in (fast, MOTION))
-    assert push / MOTION.forces[0] == pytest.approx(33.0 / MOTION.own_frequency(0)) and push >= slow
-    (steady,), (same,) = (_unit(m, candidate(pair(), "constant_force", "q1")) for m in (fast, MOTION))
-    assert steady == same
+    problem, scales = pair(), {}
+    for highest in (30.0, 0.0):
+        priors = with_effects(problem, priors_without_effects(problem), replace(MOTION, highest=highest))
+        scales[highest] = {c.key: priors.scales[c.first] for c in problem.equations.candidates}
+    fast, slow = (scales[h][("periodic_forcing", ("q1",))] for h in (30.0, 0.0))
+    assert fast / (0.3 * MOTION.forces[0]) == pytest.approx(33.0 / MOTION.own_frequency(0)) and fast >= slow
+    steady, same = (scales[h][("constant_force", ("q1",))] for h in (30.0, 0.0))
+    assert steady == same == pytest.approx(0.3 * MOTION.forces[0])
 
 
 def test_a_stop_may_lie_where_a_body_comes_to_rest():

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._effects import COORDINATE, IMPULSE, MEMORIES, OUTLIERS, PAIR, Candidate
+from .._effects import COORDINATE, FORCING, IMPULSE, MEMORIES, OUTLIERS, PAIR, Candidate
 from .._simulation_records import SimulationFile
 from . import _document as document
 from ._along import along, energy, force
@@ -266,8 +266,10 @@ class Answer:
         if one.effect.acts_on != COORDINATE or one.effect in MEMORIES or not self._there[:, one.place].any():
             return None
         amplitudes = self.after.z[place][: one.effect.amplitudes]
-        scales = self.found.priors.scales[one.first : one.first + one.effect.amplitudes]
-        return float(np.linalg.norm(amplitudes / scales)) * STRENGTH
+        priors, values = self.found.priors, slice(one.first, one.first + one.effect.amplitudes)
+        if one.effect is FORCING and priors.forces is not None:  # its prior is wider
+            return float(np.linalg.norm(amplitudes) / priors.forces[one.place])
+        return float(np.linalg.norm(amplitudes / priors.scales[values])) * STRENGTH
 
     @cached_property
     def _there(self) -> np.ndarray:

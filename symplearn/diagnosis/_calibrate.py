@@ -37,7 +37,8 @@ class Priors:
     `centres` and `scales` are by entry of the coefficient vector; `unseen` is the prior sd of the start of an unseen
     oscillator, by the coordinate that it hangs on. `lower` and `upper` bound where an effect may be placed, by entry of
     the coefficient vector; `windows`, where given, from when to when every recording is read, in which alone something
-    may happen at once; `sizes`, where given, how large the motion is in every direction that a start is unknown in.
+    may happen at once; `sizes`, where given, how large the motion is in every direction that a start is unknown in, and
+    `forces` those already there, by coordinate.
     """
 
     mean: Float[np.ndarray, " z"]
@@ -50,6 +51,7 @@ class Priors:
     powers: Any = None  # `Powers` of the frictions along the motion
     windows: Float[np.ndarray, "recording 2"] | None = None
     sizes: Float[np.ndarray, " state"] | None = None  # infinite where the start is known
+    forces: Float[np.ndarray, " d"] | None = None
 
     def widths(self, problem: Problem) -> Float[np.ndarray, " parameter"]:
         """Standard deviations of the calibrated parameters; 0 where nothing gives a size."""

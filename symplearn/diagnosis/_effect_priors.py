@@ -35,6 +35,8 @@ def with_effects(problem: Problem, priors: Priors, motion: Motion) -> Priors:
         if one.effect is effects.HIDDEN:
             loose = _looseness(problem, priors, motion, one.place)
             scales[amplitudes] *= np.hypot(1.0, loose / STRENGTH) * np.hypot(1.0, loose)
+        if one.effect is effects.FORCING:
+            scales[amplitudes] *= _fast(motion, one.place)
         if one.effect is effects.DELAY:
             scales[one.first], upper[one.first] = problem.latest / 2, problem.latest
         if one.effect.places:
@@ -45,7 +47,13 @@ def with_effects(problem: Problem, priors: Priors, motion: Motion) -> Priors:
     scales = np.where(np.isfinite(scales) & (scales > 0), scales, 1.0)
     starts = [_unseen(motion, i, _looseness(problem, priors, motion, i)) for i in range(problem.equations.declared)]
     return replace(priors, centres=centres, scales=scales, lower=lower, upper=upper, unseen=np.array(starts),
-                   powers=powers(problem, motion), windows=motion.windows)  # fmt: skip
+                   powers=powers(problem, motion), windows=motion.windows, forces=motion.forces)  # fmt: skip
+
+
+def _fast(motion: Motion, i: int) -> float:
+    """By how many times as much as those already there a periodic force may be: what moves a body as far in a shorter
+    time is the stronger by the square of their ratio, and this is the middle of all orders of magnitude between."""
+    return float(max(1.0, motion.frequencies[1] / motion.own_frequency(i)))
 
 
 def _looseness(problem: Problem, priors: Priors, motion: Motion, i: int) -> float:
@@ -94,9 +102,7 @@ def _force_unit(motion: Motion, one: Candidate) -> tuple[float, ...]:
         return (1.0,) * one.effect.amplitudes  # see `with_nameless`
     if one.effect is effects.IMPULSE:
         return (push / motion.own_frequency(i),)
-    # A cosine and a sine, whose root mean squares add in squares. What moves a body as far in a shorter time is the
-    # stronger by the square of their ratio: the middle of all orders of magnitude.
-    return (push * max(1.0, motion.frequencies[1] / motion.own_frequency(i)),) * 2
+    return (push,) * 2  # a cosine and a sine, whose root mean squares add in squares
 
 
 def _pair_unit(motion: Motion, one: Candidate) -> tuple[float, ...]:

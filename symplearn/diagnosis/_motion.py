@@ -91,15 +91,12 @@ def motion_along(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarr
     turning = 0.5 * (push - along_all(problem, force, z, back))[:, :d] * v[:, :d]
     p, span = np.concatenate(paths)[:, problem.equations.momentum], max(np.ptp(r.times) for r in problem.rows)
     own = [each[:, np.equal(problem.equations.pushed, i)] for i in range(d)]
-    times = tuple(r.times[: len(path)] for r, path in zip(problem.rows, paths, strict=True))
-    there = [_there(push[:, i], own[i], rms(p[:, i]) / span) for i in range(d)]
-    needed = _needed([path[:, problem.equations.momentum] for path in paths], times)
     return Motion(
         q=np.concatenate([path[:, :d] for path in paths]),
         v=v[:, :d],
-        forces=np.fmax(there, needed),
+        forces=np.array([_there(push[:, i], own[i], rms(p[:, i]) / span) for i in range(d)]),
         levels=np.array([rms(column) for column in shown.T]),
-        times=times,
+        times=tuple(r.times[: len(path)] for r, path in zip(problem.rows, paths, strict=True)),
         stiffening=stiffening(problem, z, paths),
         turning=turning,
         highest=2 * np.pi * max(highest_frequency(r.times, r.readings) for r in problem.rows),
@@ -112,15 +109,6 @@ def _there(push: Float[np.ndarray, " row"], parts: Float[np.ndarray, "row part"]
     apart = sum(_mean_square(one) for one in (push - parts.sum(1), *parts.T))
     square = max(_mean_square(push), apart)
     return float(np.sqrt(square)) if square > 0 else stop
-
-
-def _needed(
-    momenta: Sequence[Float[np.ndarray, "_ d"]], times: Sequence[Float[np.ndarray, " _"]]
-) -> Float[np.ndarray, " d"]:
-    """Root mean square of the forces that momenta need to change as they do, whatever exerts them."""
-    gaps = np.concatenate([np.diff(t) for t in times])
-    squares = np.concatenate([np.diff(p, axis=0) ** 2 for p in momenta]) / gaps[:, None]
-    return np.sqrt(squares.sum(0) / gaps.sum())
 
 
 def stiffening(
