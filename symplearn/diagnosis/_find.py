@@ -12,7 +12,7 @@ from ._ahead import look_ahead
 from ._build import augmented_equations, build, first_substep, refined, rows_fitted
 from ._found import Found, doubtful_outliers, speaker
 from ._lasting import total_noise
-from ._late import without_the_time_before
+from ._late import left_out, without_the_time_before
 from ._nameless import is_clear, weigh_nameless
 from ._null_paths import rough_noise
 from ._options import Options
@@ -25,7 +25,7 @@ from ._usable import check_columns, check_fitted, check_motion, check_searched, 
 # Third differences show the noise and some of the motion: the share of them that counts as noise at least.
 _ROUGH = 0.3
 # How often a search begins, at most, without what was found to be of another time.
-_ANEW = 3
+_ANEW = 2
 
 
 def searched(
@@ -36,16 +36,15 @@ def searched(
 
     `InputError` where there is nothing to fit, to search or to step.
     """
-    told: dict[str, None] = {}
+    given = recordings
+    search, rebuild, steps = _begun(file, recordings, options, deadline)
     for _ in range(_ANEW):
-        search, rebuild, steps = _begun(file, recordings, options, deadline)
-        if not search.found.complete:
-            break
-        shown, why = without_the_time_before(search.stepper, search.found, recordings)
-        if not why:
+        shown = without_the_time_before(search.stepper, search.found, recordings)
+        if shown is None or not search.in_time():
             break
         options.progress("searching once more without what late sensors show of the time before")
-        recordings, told = shown, told | dict.fromkeys(why)
+        recordings = shown
+        search, rebuild, steps = _begun(file, recordings, options, deadline)
     weigh_nameless(file, recordings, options, search, steps[0])
     likeliest = max(search.found.estimates, key=search.found.odds)
     if any(search.problem.candidate(m).nameless for m in likeliest):  # its shape may pass faster than the motion
@@ -55,7 +54,7 @@ def searched(
     options.progress("comparing how well answers predict ahead")
     look_ahead(search.stepper, found, search.rows)
     found.is_fine = steps[1]
-    return found, search.stepper, list(told)
+    return found, search.stepper, left_out(given, recordings)
 
 
 def _begun(

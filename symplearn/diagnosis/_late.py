@@ -20,25 +20,26 @@ _BROAD = 3.0
 _OFF = 2.0
 
 
-def without_the_time_before(
-    stepper: Stepper, found: Found, recordings: Sequence[Recording]
-) -> tuple[list[Recording], list[str]]:
-    """The recordings without what sensors that are late, by the likeliest answer, showed of the time before them, and
-    what was left out, in sentences; as they are where that is how the motion would have been."""
+def without_the_time_before(stepper: Stepper, found: Found, recordings: Sequence[Recording]) -> list[Recording] | None:
+    """The recordings without what sensors that are late, by the likeliest answer, showed of the time before them; None
+    where there is no such reading, or that is how the motion would have been."""
     e = found.of(max(found.estimates, key=found.odds), "white")
     if e is None or not np.isfinite(e.log_evidence):
-        return list(recordings), []
+        return None
     late = [_latest(stepper.problem, e, r) for r in range(len(recordings))]
     hidden = [_before(one, delay) for one, delay in zip(recordings, late, strict=True)]
-    number = sum(one.sum(0) for one in hidden)
-    if not np.any(number) or not (stepper.problem.equations.inputs or _is_off(stepper, e, late)):
-        return list(recordings), []
-    out = [replace(one, readings=np.where(some, np.nan, one.readings))
-           for one, some in zip(recordings, hidden, strict=True)]  # fmt: skip
-    told = [f"the sensor of {column} is late: its first readings, {n} in all, show the time before the recording and "
-            "were left out" for column, n in zip(recordings[0].columns, np.asarray(number).tolist(), strict=True)
+    if not any(one.any() for one in hidden) or not (stepper.problem.equations.inputs or _is_off(stepper, e, late)):
+        return None
+    return [replace(one, readings=np.where(some, np.nan, one.readings))
+            for one, some in zip(recordings, hidden, strict=True)]  # fmt: skip
+
+
+def left_out(given: Sequence[Recording], used: Sequence[Recording]) -> list[str]:
+    """What of the recordings given was left out for that, in sentences."""
+    numbers = sum(np.isnan(b.readings).sum(0) - np.isnan(a.readings).sum(0) for a, b in zip(given, used, strict=True))
+    return [f"the sensor of {column} is late: its first readings, {n} in all, show the time before the recording and "
+            "were left out" for column, n in zip(given[0].columns, np.asarray(numbers).tolist(), strict=True)
             if n]  # fmt: skip
-    return out, told
 
 
 def _before(recording: Recording, late: Float[np.ndarray, " channel"]) -> Bool[np.ndarray, "time channel"]:
