@@ -233,7 +233,7 @@ class SimulatedReading(eqx.Module):
     ) -> Float[Array, " channel"]:
         t, known = context
         system = self.system.at(t, known)  # a reading is taken at an instant
-        off = system.of(BIAS) + system.of(DRIFT) * (t - system.equations.start)
+        off = system.of(BIAS) + system.of(DRIFT) * (t - system.equations.start - system.of(DRIFT, 1))
         seen = self._seen(system, x, known) if system.equations.delayed else _shown(system, x)
         return (1 + system.of(GAIN)) * seen + off
 

@@ -217,7 +217,7 @@ class Simulated(eqx.Module):
             after = jnp.clip((t - of(REGIME, 1)) / wide + 0.5, 0.0, 1.0)
             return factor * (1 + self._oscillation(MODULATION, t)) * (1 + of(REGIME) * after)
 
-        factor = (1 + of(ERROR)) * (1 + of(DRIFTING) * (t - self.equations.start))
+        factor = (1 + of(ERROR)) * (1 + of(DRIFTING) * (t - self.equations.start - of(DRIFTING, 1)))
         factor = jax.lax.cond(self.switches.changes, changed, lambda factor: factor, factor)
         n = factor.shape[0]
         parameters = jnp.concatenate([self.parameters[:n] * factor, self.parameters[n:]])

@@ -133,6 +133,16 @@ class Oscillating(Effect):
 
 
 @dataclass(frozen=True)
+class Drifting(Effect):
+    """Grows evenly with t - t_0. A further entry of the coefficient vector tells by how much a recording's own t_0, its
+    first row used, is later than the first recording's."""
+
+    @property
+    def entries(self) -> int:
+        return self.size + 1
+
+
+@dataclass(frozen=True)
 class SelfExcitation(Effect):
     """F = c (1 - q^2/a^2) v, inside c v - e q^2 v."""
 
@@ -210,12 +220,12 @@ SPRING = Effect("coupling_spring")
 CENTRAL = Effect("central_correction")
 GYROSCOPIC = Effect("gyroscopic_coupling")
 ERROR = Effect("parameter_error")
-DRIFTING = Effect("parameter_drift")
+DRIFTING = Drifting("parameter_drift")
 REGIME = Effect("regime_change", places=("t_star",))
 MODULATION = Oscillating("parametric_modulation", amplitudes=2, places=("omega",))
 BIAS = Effect("sensor_bias")
 GAIN = Effect("sensor_gain")
-DRIFT = Effect("sensor_drift")
+DRIFT = Drifting("sensor_drift")
 DELAY = Effect("sensor_delay", positive=True)
 # These two change how readings scatter and not where they lie, so they have no value in the model.
 NOISE = Effect("sensor_noise", amplitudes=0)

@@ -17,7 +17,9 @@ from symplearn.diagnosis._stochastic import free_run
 T = np.linspace(0.0, 20.0, 401)
 Q = np.stack([1.3 * np.cos(T), 0.4 * np.sin(1.7 * T + 0.3)], axis=1)
 V = np.stack([-1.3 * np.sin(T), 0.68 * np.cos(1.7 * T + 0.3)], axis=1)
-MOTION = Motion(Q, V, np.array([1.3, 0.8]), np.ones(2), (T,), np.zeros((2, 0)), np.zeros_like(Q))
+MOTION = Motion(
+    Q, V, np.array([1.3, 0.8]), np.ones(2), (T,), np.zeros((2, 0)), np.zeros_like(Q), momenta=np.array([1.3, 0.68])
+)
 PAIR = "p1**2/2 + ({unit})**2*p2**2/2 + k*q1**2/2 + 1.5*(q2/({unit}))**2"
 
 
@@ -107,6 +109,41 @@ def test_how_fast_something_drifts_is_told_by_a_recording_alone(effect):
         one = next(c for c in problem.equations.candidates if c.effect.name == effect)
         scales.append(priors_of(problem).scales[one.first])
     assert scales == pytest.approx([scales[0]] * 3)
+
+
+@pytest.mark.parametrize("effect", ["sensor_drift", "parameter_drift"])
+def test_a_drift_counts_from_the_first_row_of_each_recording(effect):
+    """Two recordings alike but for their clocks show the same drift, from nothing at their first rows."""
+    problem, z = pair(clocks=(3.0, 1e4)), None
+    target = {"sensor_drift": "y1", "parameter_drift": "k"}[effect]
+    m = next(m for m in problem.searched if problem.candidate(m).key == (effect, (target,)))
+    z, runs = np.zeros(problem.size), []
+    z[dict(problem.placed((m,)))[m]] = 0.02
+    x = np.array([1.3, 0.4, 0.0, 0.0, 0.2, 0.0])
+    for combination in ((m,), ()):
+        runs.append([free_run(problem, course, z * bool(combination), combination, r, x, 0)[0][:, 0]
+                     for r, course in enumerate(courses(problem))])  # fmt: skip
+    (first, second), (still, _) = runs
+    # Round-off of times of 1e4 in a drift over twenty.
+    np.testing.assert_allclose(second, first, atol=1e-9)
+    rates = lambda t, x: [x[1], -(1 + 0.02 * t) * x[0]]  # noqa: E731
+    drifted = still + 0.02 * T if effect == "sensor_drift" else cases.solved(rates, [1.3, 0.0], T)[:, 0]
+    # A method of order four in steps of a 126th of the period.
+    np.testing.assert_allclose(first, drifted, atol=1e-5)
+    assert np.abs(drifted - still).max() > 0.1
+
+
+def test_a_blow_may_be_what_set_a_body_in_motion():
+    """However soon it comes to rest again: half of its largest momentum is within the prior of a blow."""
+    decay = np.exp(-T)
+    motion = replace(MOTION, forces=MOTION.forces / 30, momenta=np.array([2.0, 0.5]),
+                     q=Q * decay[:, None], v=V * decay[:, None])  # fmt: skip
+    problem = pair()
+    priors = with_effects(problem, priors_without_effects(problem), motion)
+    blow = candidate(problem, "impulse", "q1")
+    assert priors.scales[blow.first] == pytest.approx(1.0)
+    (push,) = _unit(motion, blow)
+    assert 0.3 * push < 0.1
 
 
 @pytest.mark.parametrize("clock", [0.0, 500.0, 1e5])

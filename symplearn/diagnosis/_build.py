@@ -9,7 +9,7 @@ import numpy as np
 import integrators as ig
 
 from .._augmented import Equations, equations
-from .._effects import DELAY, EFFECTS, ERROR, HIDDEN, NOISE, OUTLIERS, UNNAMED, Candidate, Effect, Nameless
+from .._effects import DELAY, EFFECTS, ERROR, HIDDEN, NOISE, OUTLIERS, UNNAMED, Candidate, Drifting, Effect, Nameless
 from .._errors import InputError, nearest, shown
 from .._expression import symbol
 from .._recording import Recording
@@ -117,6 +117,9 @@ def build(
     past = _aligned(latest + _known_lateness(file), recordings) if built.delayed else None
     rows = tuple(lay_out(recordings, holdout, averaged, substep, bool(file.initial), past))
     parameters, known, calibrated = _values(file, built, len(recordings))
+    for one in built.candidates:
+        if isinstance(one.effect, Drifting):
+            known[:, one.first + one.effect.size] = [r.times[0] - built.start for r in recordings]
     return Problem(
         equations=built,
         integrator=_integrator(file, built),

@@ -22,6 +22,8 @@ STRENGTH = 0.3
 _DEPTH = 3e-5
 # Share of the rows that at least lie inside of a stop.
 _RESTING = 0.1
+# Share of the largest momentum that a blow may be, as one that sets in motion what was at rest.
+_BLOW = 0.5
 # Root mean square over the recording of what grows evenly to one, and of what is one in half of it: their inverses.
 _EVEN, _HALF = np.sqrt(3.0), np.sqrt(2.0)
 
@@ -37,6 +39,8 @@ def with_effects(problem: Problem, priors: Priors, motion: Motion) -> Priors:
             scales[amplitudes] *= np.hypot(1.0, loose / STRENGTH) * np.hypot(1.0, loose)
         if one.effect is effects.FORCING:
             scales[amplitudes] *= _fast(motion, one.place)
+        if one.effect is effects.IMPULSE:
+            scales[amplitudes] = np.fmax(scales[amplitudes], _BLOW * motion.momenta[one.place])
         if one.effect is effects.DELAY:
             scales[one.first], upper[one.first] = problem.latest / 2, problem.latest
         if one.effect.places:

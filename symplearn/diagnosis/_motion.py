@@ -47,6 +47,7 @@ class Motion:
     stiffening: Float[np.ndarray, "d parameter"] = field(default_factory=lambda: np.zeros((1, 0)))
     # Power that forces which turn round with the motion feed into each coordinate, by row.
     turning: Float[np.ndarray, "row d"] = field(default_factory=lambda: np.zeros((0, 1)))
+    momenta: Float[np.ndarray, " d"] = field(default_factory=lambda: np.zeros(1))  # the largest
     highest: float = 0.0  # frequency that stands out of the noise of a reading, in rad/time
 
     @property
@@ -99,6 +100,7 @@ def motion_along(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarr
         times=tuple(r.times[: len(path)] for r, path in zip(problem.rows, paths, strict=True)),
         stiffening=stiffening(problem, z, paths),
         turning=turning,
+        momenta=np.nanmax(np.abs(p), axis=0),
         highest=2 * np.pi * max(highest_frequency(r.times, r.readings) for r in problem.rows),
     )
 
