@@ -7,7 +7,9 @@ whose widths are spread evenly in their logarithm. Fits are made under the wides
 One effect alone may be too weak for the recording to show: so much is left of its prior where nothing is seen, and the
 simulation as it is is as much less certain. Of several each is one that the recording can show; with a weaker one among
 them they are the smaller combination. So each Gaussian is multiplied there by the square of the strength, which leaves
-nothing at zero (the moment prior of Johnson and Rossell 2010): what is not needed counts far less than what is.
+nothing at zero (the moment prior of Johnson and Rossell 2010): what is not needed counts far less than what is. And
+they have that share of the prior which the one has alone that is shown best: with another one beside it, an effect is
+not the likelier for what it could have been without being seen.
 """
 
 import itertools
@@ -55,14 +57,18 @@ def strength_gain(
     of a self-excitation what is fed in."""
     total, blocks = log_fed(problem, combination, priors.powers, z, covariance), []
     alone = sum(problem.candidate(member).effect.amplitudes > 0 for member in combination) == 1
+    seen = []
     for member in combination:
         entries = strength_entries(problem, combination, member)
+        if len(entries):
+            seen.append(_seen_share(problem, combination, priors, covariance, entries))
         if problem.candidate(member).effect is EXCITATION:
             total += turning_gain(
                 z[entries], covariance[np.ix_(entries, entries)], priors.scales[problem.candidate(member).values], alone
             )
         elif len(entries):
             blocks.append(entries)
+    total += 0.0 if alone or not seen else float(np.log(max(seen)))
     if not blocks:
         return total
     a, own = np.concatenate(blocks), np.repeat(np.arange(len(blocks)), [len(b) for b in blocks])
@@ -72,6 +78,22 @@ def strength_gain(
     bounds = problem.lower_bounds(combination)
     lowest = np.array([bounds.get(int(k), -np.inf) for k in a]) / unit
     return total + mixture_gain(centre, spread, own, lowest, alone)
+
+
+def _seen_share(
+    problem: Problem,
+    combination: Combination,
+    priors: Priors,
+    covariance: Float[np.ndarray, "z z"],
+    entries: Int[np.ndarray, " entry"],
+) -> float:
+    """Share of the prior of an effect that the recording shows."""
+    unit = priors.precision_of(problem, combination)[entries] ** -0.5
+    spread = covariance[np.ix_(entries, entries)] / np.outer(unit, unit)
+    if not np.isfinite(spread).all():
+        return 1.0
+    known = np.mean(np.maximum(1.0 / np.clip(np.linalg.eigvalsh(spread), 1e-300, None) - 1.0, 0.0))
+    return max(1.0 - faint_share(float(known) ** -0.5 if known > 0 else np.inf), 1.0 / FAINT_WIDTHS)
 
 
 def turning_gain(centre: np.ndarray, spread: np.ndarray, scales: np.ndarray, alone: bool = False) -> float:
