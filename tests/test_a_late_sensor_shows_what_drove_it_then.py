@@ -1,8 +1,11 @@
 """A sensor that is late shows the motion of the time before, under the inputs of that time."""
 
+from dataclasses import replace
+
 import engine_cases as cases
 import numpy as np
 import pytest
+from posterior_cases import estimate, found, made, place
 from scipy.linalg import expm
 
 from symplearn._inputs import Inputs
@@ -12,6 +15,7 @@ from symplearn.diagnosis._build import augmented_equations
 from symplearn.diagnosis._course import courses
 from symplearn.diagnosis._effect_priors import with_effects
 from symplearn.diagnosis._forecast import _ahead
+from symplearn.diagnosis._late import left_out
 from symplearn.diagnosis._motion import motion_along
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._stochastic import free_run
@@ -147,6 +151,21 @@ def test_what_a_late_sensor_shows_of_the_time_before_is_left_out(is_driven):
     assert told["probability"] > 0.9 and abs(tau_told["mean"] - tau) < 4 * tau_told["sd"]
     (said,) = [one for one in told["warnings"] if "left out" in one]
     assert said.startswith("the sensor of y is late: its first readings, 3 in all")
+
+
+def test_what_is_told_of_it_is_what_the_answer_says():
+    """Where a delay was the likeliest at first and is none of the answer, the sensor is told to have seemed late."""
+    problem = made(1)
+    given = cases.recorded(np.arange(10.0), np.ones((10, 2)), columns=("a", "b"))
+    used = replace(given, readings=np.where(np.arange(10)[:, None] < [0, 2], np.nan, 1.0))
+    delay = place(problem, "sensor_delay", "b")
+    late = estimate(problem, (delay,), 20.0)
+    late.z[dict(problem.placed((delay,)))[delay]] = 1.5
+    for best, how in (((), "seemed to be late"), ((delay,), "is late")):
+        estimates = [estimate(problem, (), 100.0 if best == () else 0.0), late]
+        (told,) = left_out(problem, found(problem, *estimates), [given], [used])
+        assert told.startswith(f"the sensor of b {how}: its first readings, 2 in all")
+    assert left_out(problem, found(problem, late), [given], [given]) == []
 
 
 def test_a_forecast_knows_the_same_of_its_inputs():

@@ -54,7 +54,7 @@ def searched(
     options.progress("comparing how well answers predict ahead")
     look_ahead(search.stepper, found, search.rows)
     found.is_fine = steps[1]
-    return found, search.stepper, left_out(given, recordings)
+    return found, search.stepper, left_out(search.problem, found, given, recordings)
 
 
 def _begun(

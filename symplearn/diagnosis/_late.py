@@ -34,12 +34,19 @@ def without_the_time_before(stepper: Stepper, found: Found, recordings: Sequence
             for one, some in zip(recordings, hidden, strict=True)]  # fmt: skip
 
 
-def left_out(given: Sequence[Recording], used: Sequence[Recording]) -> list[str]:
-    """What of the recordings given was left out for that, in sentences."""
+def left_out(
+    problem: Problem, found: Found, given: Sequence[Recording], used: Sequence[Recording]
+) -> list[str]:  # fmt: skip
+    """What of the recordings given was left out for that, in sentences, and whether the answer has it so at last."""
+    e = found.of(max(found.estimates, key=found.odds), "white")
+    late = np.max([_latest(problem, e, r) for r in range(len(given))], axis=0) if e else np.zeros(problem.channels)
     numbers = sum(np.isnan(b.readings).sum(0) - np.isnan(a.readings).sum(0) for a, b in zip(given, used, strict=True))
-    return [f"the sensor of {column} is late: its first readings, {n} in all, show the time before the recording and "
-            "were left out" for column, n in zip(given[0].columns, np.asarray(numbers).tolist(), strict=True)
-            if n]  # fmt: skip
+    told = []
+    for column, is_late, n in zip(given[0].columns, late > 0, np.asarray(numbers).tolist(), strict=True):
+        how = "is late" if is_late else "seemed to be late"
+        told += [f"the sensor of {column} {how}: its first readings, {n} in all, show the time before the recording "
+                 "and were left out"] * (n > 0)  # fmt: skip
+    return told
 
 
 def _before(recording: Recording, late: Float[np.ndarray, " channel"]) -> Bool[np.ndarray, "time channel"]:
