@@ -274,10 +274,9 @@ def _inputs_back(
 ) -> Float[Array, " input"]:
     """The inputs' mean in one of the steps of some length back from a reading; as they stand, where no more is
     known."""
-    now = known[:number]
     if len(known) == number:
-        return now
-    piece, means = known[number], known[number + 1 :].reshape(-1, number)
+        return known
+    now, piece, means = _past(known, number)
 
     def since(age: Array) -> Float[Array, " input"]:
         """Their integral from so long before the reading on."""
@@ -289,13 +288,17 @@ def _inputs_back(
     return jnp.where(is_short, means[0], mean)
 
 
+def _past(known: Float[Array, " known"], number: int) -> tuple[Array, Array, Array]:
+    """The inputs as they stand, the length of a piece of the time before, and their means in each."""
+    return known[:number], known[number], known[number + 1 :].reshape(-1, number)
+
+
 def _input_then(known: Float[Array, " known"], number: int, delay: Float[Array, ""]) -> Float[Array, " input"]:
     """The inputs as they stood a delay ago, from one middle of a piece to the next; as they stand, where no more is
     known."""
-    now = known[:number]
     if len(known) == number:
-        return now
-    piece, means = known[number], known[number + 1 :].reshape(-1, number)
+        return known
+    now, piece, means = _past(known, number)
     middles = piece * (np.arange(len(means)) + 0.5)
     begins, gaps = jnp.append(0.0, middles[:-1]), piece * np.append(0.5, np.ones(len(means) - 1))
     share = jnp.clip((delay - begins) / jnp.where(gaps > 0, gaps, 1.0), 0.0, 1.0)  # rows that only fill up have none

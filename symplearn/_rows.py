@@ -77,14 +77,15 @@ def lay_out(
     ]
 
 
-def _fitted_count(n: int, holdout: float) -> int:
+def fitted_count(n: int, holdout: float) -> int:
+    """How many of so many rows are fitted."""
     return max(n - math.floor(n * holdout + 1e-9), 2)
 
 
 def _thinned(recording: HasRows, holdout: float, width: float, is_begun: bool) -> tuple[Thinned, int]:
     """Fitted and held-out rows thinned apart, end to end, and how many of them are fitted."""
     n = len(recording.times)
-    keep = _fitted_count(n, holdout)
+    keep = fitted_count(n, holdout)
     begin = [0, 1, keep] if is_begun else [0, keep]
     parts = [thin(recording.times[a:b], recording.readings[a:b], width) for a, b in pairwise([*begin, n]) if b > a]
     fitted = sum(len(part.times) for part in parts[: len(begin) - 1])
@@ -108,7 +109,7 @@ def _one(
         fitted=int(places[first - 1]) + 1,
         given=len(recording.times),
         used=len(rows.times),
-        boundary=float(recording.times[_fitted_count(len(recording.times), holdout) - 1]),
+        boundary=float(recording.times[fitted_count(len(recording.times), holdout) - 1]),
     )
 
 

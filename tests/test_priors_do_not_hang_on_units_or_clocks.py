@@ -212,3 +212,16 @@ def test_a_stop_may_lie_where_a_body_comes_to_rest():
     floor = next(c for c in pair().equations.candidates if c.key[0] == "contact_stop" and c.side == "lower")
     low, high = _range(replace(MOTION, q=q), floor)
     assert low == pytest.approx(-0.01) and high > 0.1
+
+
+def test_what_is_held_out_says_nothing_beforehand():
+    """How late a sensor may be and how fast an oscillation are told by the rows that are fitted, alone."""
+    times = 0.05 * np.arange(400)
+    slow = np.cos(1.5 * times)
+    fast = np.where(np.arange(400) < 300, slow, np.cos(50.0 * times))
+    file, found = cases.simulation("p**2/2 + q**2/2"), []
+    for readings in (slow, fast):
+        problem = cases.problem(file, [cases.recorded(times, readings)], 0.05, holdout=0.25)
+        motion = motion_along(problem, np.zeros(problem.size), [np.ones((300, problem.state))])
+        found.append([problem.latest, motion.highest])
+    assert found[0] == found[1] and found[0][0] > 5 * 0.05

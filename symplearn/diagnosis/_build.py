@@ -13,7 +13,7 @@ from .._effects import DELAY, EFFECTS, ERROR, HIDDEN, NOISE, OUTLIERS, UNNAMED, 
 from .._errors import InputError, nearest, shown
 from .._expression import symbol
 from .._recording import Recording
-from .._rows import HasRows, Rows, bin_width, lay_out
+from .._rows import HasRows, Rows, bin_width, fitted_count, lay_out
 from .._simulation_records import Quantity, SimulationFile
 from .._symbolic import TooLarge
 from .._terms import calibrated_names, mechanics, noise_factor
@@ -33,7 +33,7 @@ _CHANGE = 0.1
 _SETTLING = 0.1  # of the first change: order one would leave a thousandth after the last halving
 # Rows that a sensor may be late by, and share of a period.
 _LATE, _LATE_BY = 5.0, 0.5
-_BROAD = 3.0  # standard deviations that a known delay may be longer
+BROAD = 3.0  # standard deviations that a sensor may be later than is known
 _HALVINGS = 6  # the first of them may only keep a stiff motion from being thrown out
 
 
@@ -113,7 +113,7 @@ def build(
     """Lay the recordings out and gather every prior."""
     # A prior of the initial state belongs to the first row, which must then stay.
     averaged = averaged_over(file, recordings)
-    latest = max(_latest(r, averaged) for r in recordings)
+    latest = max(_latest(r, fitted_count(len(r.times), holdout), averaged) for r in recordings)
     past = _aligned(latest + _known_lateness(file), recordings) if built.delayed else None
     rows = tuple(lay_out(recordings, holdout, averaged, substep, bool(file.initial), past))
     parameters, known, calibrated = _values(file, built, len(recordings))
@@ -140,11 +140,13 @@ def build(
     )
 
 
-def _latest(recording: Recording, averaged: float) -> float:
-    """How late a sensor may be: some rows, or a share of the motion's shortest period, of which there may be many."""
-    seen = [recording.times[~np.isnan(column)] for column in recording.readings.T]
-    gaps = [averaged, *(float(np.median(np.diff(times))) for times in seen if len(times) > 1)]
-    frequency = highest_frequency(recording.times, recording.readings)
+def _latest(recording: Recording, fitted: int, averaged: float) -> float:
+    """How late a sensor may be by its fitted rows: some of them, or a share of the motion's shortest period, of which
+    there may be many."""
+    times, readings = recording.times[:fitted], recording.readings[:fitted]
+    seen = [times[~np.isnan(column)] for column in readings.T]
+    gaps = [averaged, *(float(np.median(np.diff(one))) for one in seen if len(one) > 1)]
+    frequency = highest_frequency(times, readings)
     return max(_LATE * max(gaps), _LATE_BY / frequency if frequency > 0 else 0.0)
 
 
@@ -157,7 +159,7 @@ def _aligned(past: float, recordings: Sequence[Recording]) -> float:
 def _known_lateness(file: SimulationFile) -> float:
     """How late sensors may be by what is known of them."""
     known = (quantity for term in file.terms if term.effect == DELAY.name for quantity in term.coefficients.values())
-    return sum((abs(one.value) + _BROAD * (0.0 if one.sd is None else one.sd) for one in known), 0.0)
+    return sum((abs(one.value) + BROAD * (0.0 if one.sd is None else one.sd) for one in known), 0.0)
 
 
 def averaged_over(file: SimulationFile, recordings: Sequence[HasRows]) -> float:

@@ -8,14 +8,13 @@ from jaxtyping import Bool, Float
 
 from .._effects import DELAY
 from .._recording import Recording
+from ._build import BROAD
 from ._found import Found
 from ._problem import Problem
 from ._stochastic import free_run
 from ._trajectory import Stepper
 from ._weighed import Estimate
 
-# Standard deviations that a sensor may be later than it was found to be.
-_BROAD = 3.0
 # How far off, in sd of the noise, what a late sensor shows first may be where no input drives the motion.
 _OFF = 2.0
 
@@ -60,7 +59,7 @@ def _latest(problem: Problem, e: Estimate, recording: int) -> Float[np.ndarray, 
     for member, place in problem.placed(e.combination):
         own = problem.members[member]
         if own.candidate.effect is DELAY and recording in own.recordings:
-            late[own.candidate.place] += _BROAD * np.sqrt(e.covariance[place.start, place.start])
+            late[own.candidate.place] += BROAD * np.sqrt(e.covariance[place.start, place.start])
     return late
 
 

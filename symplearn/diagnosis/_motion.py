@@ -101,7 +101,7 @@ def motion_along(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarr
         stiffening=stiffening(problem, z, paths),
         turning=turning,
         momenta=np.nanmax(np.abs(p), axis=0),
-        highest=2 * np.pi * max(highest_frequency(r.times, r.readings) for r in problem.rows),
+        highest=2 * np.pi * max(highest_frequency(r.times[: r.fitted], r.readings[: r.fitted]) for r in problem.rows),
     )
 
 

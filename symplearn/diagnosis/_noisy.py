@@ -7,11 +7,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ._calibrate import Priors, weights
-from ._evidence import Laplace, laplace
+from ._evidence import Laplace
 from ._path import backward_lanes, forward_lanes, linearise
 from ._problem import Combination, Problem
 from ._stochastic import exposure, padded
 from ._trajectory import LANES, Stepper
+from ._weighed import under_priors
 
 # Steps towards a smaller or larger reading noise are lengthened this much: plain EM is slow where noise is small.
 _HASTE = 1.5
@@ -182,13 +183,7 @@ def _integrated(problem: Problem, fit: PathFit, passes, priors: Priors, weight) 
         sign[1:] = -1.0
         gram[np.ix_(place, place)] += g * np.outer(sign, sign)
         offset -= 0.5 * (float(logs) + (fit.used(r, weight[r]) > 0).sum() * np.log(2 * np.pi))
-    if not np.isfinite(gram).all():
-        return Laplace(-np.inf, np.zeros(problem.size), np.zeros((problem.size, problem.size)), 0.0)
-    precision = priors.precision_of(problem, fit.combination)
-    one = laplace(gram, offset, fit.z, priors.mean_of(problem, fit.combination), precision,
-                  problem.active(fit.combination), problem.lower_bounds(fit.combination),
-                  priors.bounds_of(problem, fit.combination))  # fmt: skip
-    return replace(one, log_evidence=one.log_evidence + priors.log_size(problem, fit.z))
+    return under_priors(problem, fit.combination, gram, offset, fit.z, priors)
 
 
 def lane_grams(

@@ -88,7 +88,7 @@ def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -
     number = sum((w > 0).sum(0) for w in weight)
     for b, combination in enumerate(fits.combinations):
         gram = np.block([[np.full((1, 1), square[b]), vector[b][None]], [vector[b][:, None], matrix[b]]])
-        one = _laplace(problem, combination, gram, offset[b], fits.z[b], priors)
+        one = under_priors(problem, combination, gram, offset[b], fits.z[b], priors)
         scores = _scores(problem, fits, b, r, weight)
         # Errors as they are where the evidence is taken: after the step that a fit which is done is granted.
         taken = one.step if fits.converged[b] else np.zeros(problem.size)
@@ -197,7 +197,7 @@ def correlated(
     for _ in range(_TURNS):
         gram, follow, log = amplitudes_out((grams / (noise**2)[:, None, None]).sum(0), 1 + problem.size)
         offset = -0.5 * float((number * np.log(2 * np.pi * noise**2) + logs).sum() + log)
-        one = _laplace(problem, combination, gram, offset, fits.z[b], priors)
+        one = under_priors(problem, combination, gram, offset, fits.z[b], priors)
         z = fits.z[b] + one.step
         column = np.concatenate([[1.0], fits.z[b] - z])
         column = np.concatenate([column, -follow @ column])
@@ -245,7 +245,8 @@ def _earned(one: Laplace, fits: Fits, lane: int) -> float:
     return one.log_evidence - (0.0 if fits.converged[lane] else one.promised)
 
 
-def _laplace(problem: Problem, combination: Combination, gram, offset: float, z, priors: Priors) -> Laplace:
+def under_priors(problem: Problem, combination: Combination, gram, offset: float, z, priors: Priors) -> Laplace:
+    """Laplace's integral of a combination from a Gram matrix of errors, by all that is known beforehand."""
     if not np.isfinite(gram).all():
         return Laplace(-np.inf, np.zeros(problem.size), np.zeros((problem.size, problem.size)), 0.0)
     precision = priors.precision_of(problem, combination)
