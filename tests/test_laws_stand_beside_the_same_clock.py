@@ -11,6 +11,7 @@ from symplearn.diagnosis._clock import weigh_shared_clock
 from symplearn.diagnosis._clocks import share_clocks, weigh_clocks
 from symplearn.diagnosis._found import Found
 from symplearn.diagnosis._score import Start
+from symplearn.diagnosis._settle import settle
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
 from symplearn.diagnosis._weighed import Mode
@@ -38,7 +39,7 @@ def test_what_the_likeliest_was_found_beside_is_tried_beside_all(weigher, near, 
     search found, and searched again from there where it is near; so is a law that was not searched for at all."""
     weigher, laws = weigher
     found, (drag, damping, _) = weigher.found, laws.values()
-    weigher.shared = None
+    weigher.shared = []
     for c in laws.values():
         found.estimates[c] = [one for one in found.estimates[c] if one.kind != "clock"]
     weigh_clocks(weigher, [damping])
@@ -71,3 +72,24 @@ def test_it_is_shared_once(weigher, monkeypatch):
     share_clocks(weigher)
     assert not tried
     assert {c: weigher.found.of(c, "clock").log_evidence for c in laws.values()} == before
+
+
+def test_what_a_search_was_caught_in_is_left_where_laws_are_settled(weigher):
+    """Of a law whose own search was caught, here in an error of the sensor alone, the settled evidence is as large as
+    beside the errors of the clock that another one's search found, be the other one far likelier."""
+    weigher, laws = weigher
+    found, (drag, damping, _) = weigher.found, laws.values()
+    weigh_clocks(weigher, [drag])
+    best = found.of(drag, "clock")
+    (good,) = weigh_shared_clock(found.problem, weigher.as_fitted([damping]), found.priors, weigher.rows, best)
+    still = replace(best, clocks=(replace(best.clocks[0], ratio=0.0),))
+    (caught,) = weigh_shared_clock(found.problem, weigher.as_fitted([damping]), found.priors, weigher.rows, still)
+    assert caught.log_evidence < good.log_evidence - 10
+    lead = best.log_evidence - caught.log_evidence  # near enough to be settled
+    caught = replace(caught, log_evidence=caught.log_evidence + max(0.0, lead - 5.0))
+    found.estimates = {drag: [e for e in found.estimates[drag] if e.kind in ("white", "clock")],
+                       damping: [found.of(damping, "white")]}  # fmt: skip
+    found.add(caught)
+    settle(weigher, lambda combination: True)
+    assert found.of(damping, "clock").clocks == best.clocks
+    assert found.of(damping, "clock").log_evidence > good.log_evidence - 3.0  # what it may owe for others

@@ -163,6 +163,22 @@ def test_a_law_gains_nothing_by_running_on_better(beside, score, counts):
     assert np.log(odds[(law,)] / odds[(damping,)]) == pytest.approx(prior + counts + 5.0, rel=1e-9)
 
 
+def test_a_law_puts_no_name_out_of_reach(beside):
+    """Of answers within 30 nats of the best, a damping stays a candidate 50 nats behind a law that leads, and another
+    law does not; nor does a name 40 nats behind that damping. What did not converge is near, and puts nothing else out
+    of reach."""
+    p, law, other, damping, bad = beside
+    found = Found(p, replace(priors_without_effects(p), scales=np.ones(p.equations.size)))
+    values = {(law,): 100.0, (other,): 50.0, (damping,): 50.0, (bad,): 10.0}
+    for c, value in values.items():
+        evidence = value - found.prices.log(c)
+        found.add(Estimate(c, "white", np.ones(p.size), np.eye(p.size), np.ones(p.channels), evidence, True))
+    assert found.near(30.0, 24) == [(law,), (damping,)]
+    assert found.near(30.0, 1) == [(law,), (damping,)]
+    found.estimates[(law,)] = [replace(found.estimates[(law,)][0], converged=False)]
+    assert set(found.near(30.0, 24)) == {(law,), (other,), (damping,)}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("missing", ["laws", "promising"])
 def test_where_there_is_no_law_and_no_expression_an_answer_is_given(monkeypatch, missing):

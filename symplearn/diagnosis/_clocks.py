@@ -45,21 +45,29 @@ def share_clocks(weigher: Weigher) -> None:
     new; what gains and is near the best is searched again from there."""
     found, base = weigher.found, set(weigher.base)
     for _ in range(_ROUNDS):
-        like = _likeliest(found)
-        if like is None or (like.colours, like.clocks) == weigher.shared:
+        fresh = [one for one in _leaders(found) if (one.colours, one.clocks) not in weigher.shared]
+        for like in fresh:
+            weigher.shared.append((like.colours, like.clocks))
+            others = [c for c in found.estimates if base <= set(c) and c != like.combination]  # of the same readings
+            before = {c: _evidence(found, c) for c in others}
+            _weigh_beside(weigher, others, like)
+            least = max(map(found.odds, found.estimates)) - _NEAR
+            near = [c for c in others if _evidence(found, c) > before[c] + _GAINED and found.odds(c) > least]
+            _search(weigher, sorted(near, key=found.odds, reverse=True)[:_MOST], like)
+        if not fresh:
             return
-        weigher.shared = like.colours, like.clocks
-        others = [c for c in found.estimates if base <= set(c) and c != like.combination]  # fitted to the same readings
-        before = {c: _evidence(found, c) for c in others}
-        _weigh_beside(weigher, others, like)
-        least = max(map(found.odds, found.estimates)) - _NEAR
-        near = [c for c in others if _evidence(found, c) > before[c] + _GAINED and found.odds(c) > least]
-        _search(weigher, sorted(near, key=found.odds, reverse=True)[:_MOST], like)
+
+
+def _leaders(found: Found) -> list[Estimate]:
+    """The likeliest estimate of this kind, and the likeliest with a word for everything."""
+    every = [one for estimates in found.estimates.values() for one in estimates if one.kind == "clock"]
+    worded = [one for one in every if not found.has_law(one.combination)]
+    best = [max(some, key=lambda one: one.log_evidence) for some in (every, worded) if some]
+    return best[:1] if best[:1] == best[1:] else best
 
 
 def _likeliest(found: Found) -> Estimate | None:
-    every = (one for estimates in found.estimates.values() for one in estimates if one.kind == "clock")
-    return max(every, key=lambda one: one.log_evidence, default=None)
+    return next(iter(_leaders(found)), None)
 
 
 def _evidence(found: Found, combination: Combination) -> float:

@@ -149,6 +149,24 @@ class Found:
         """The same with the combination's prior: what its probability goes with."""
         return self.best(combination) + self.prices.log(combination)
 
+    def near(self, reach: float, most: int) -> list[Combination]:
+        """The likeliest, so many at most that are no more nats behind the best; and as many of those with a word for
+        everything that are no farther behind the best of these: a law without a word explains what no name explains,
+        and is no better extrapolation.
+
+        What did not converge may promise more than there is; it is among them, but nothing falls behind it.
+        """
+        ranked = sorted(self.estimates, key=self.odds, reverse=True)
+        chosen: set[Combination] = set()
+        for alike in (ranked, [c for c in ranked if not self.has_law(c)]):
+            sound = [e.log_evidence + self.prices.log(c) for c in alike for e in self.estimates[c] if e.converged]
+            chosen |= {c for c in alike[:most] if self.odds(c) > max(sound, default=-np.inf) - reach}
+        return [c for c in ranked if c in chosen]
+
+    def has_law(self, combination: Combination) -> bool:
+        """Whether a combination holds a force without a word."""
+        return any(self.problem.candidate(m).nameless is not None for m in combination)
+
     def told(self, combination: Combination, best: Estimate) -> Estimate:
         """The estimate whose numbers are told: the best one; where a clear remainder is left, the trajectory fit if
         that holds on ahead, as wide as its errors are long-lived."""

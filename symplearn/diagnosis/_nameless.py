@@ -269,8 +269,7 @@ def _is_open(odds: Posterior, found: Found) -> bool:
     if not odds.named or odds.unexplained >= odds.named[0].probability:
         return True
     best = odds.named[0].best
-    has_law = any(found.problem.candidate(m).nameless for m in best.combination)
-    return not has_law and (len(best.combination) == MOST or is_clear(found, best))
+    return not found.has_law(best.combination) and (len(best.combination) == MOST or is_clear(found, best))
 
 
 def is_clear(found: Found, best: Estimate) -> bool:

@@ -69,7 +69,7 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     if not np.isfinite(top):
         return Posterior(0.0, 1.0, (), 0.0, speaker(found.estimates[()]), {(): -np.inf}, factor, False)
     unseen = min((one.score for one in found.ahead.values()), default=0.0)
-    named_runs = max((one.score for c, one in found.ahead.items() if not _is_nameless(problem, c)), default=unseen)
+    named_runs = max((one.score for c, one in found.ahead.items() if not found.has_law(c)), default=unseen)
     bare = found.of((), "white")
     least = -np.inf if bare is None else top + factor * (bare.log_evidence - top)
     constant = top + factor * (constant_evidence(problem, bare) - top)
@@ -78,7 +78,7 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     for combination, estimates in found.estimates.items():
         tempered = {e.kind: top + factor * (e.log_evidence - top) for e in estimates}
         ahead = found.ahead[combination].score if combination in found.ahead else unseen
-        if _is_nameless(problem, combination):  # it explains what no name explains, and is no better extrapolation
+        if found.has_law(combination):  # it explains what no name explains, and is no better extrapolation
             ahead = min(ahead, named_runs)
         plain = tempered.get("white", -np.inf) + ahead
         beside, doubtful = _beside_a_remainder(tempered, least if combination else np.inf, remainder, ahead)
@@ -113,10 +113,6 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
         tempered=factor,
         is_constant=bool(constant > max(evidences[c] for c in ((), *(c for c, *_ in named))) - _AS_WELL),
     )
-
-
-def _is_nameless(problem: Problem, combination: Combination) -> bool:
-    return any(problem.candidate(m).nameless is not None for m in combination)
 
 
 def _predicts(problem: Problem, found: Found, combination: Combination) -> bool:

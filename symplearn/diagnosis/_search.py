@@ -110,10 +110,7 @@ class Search:
     def again(self, stepper: Stepper) -> Found:
         """Fit and weigh the best combinations anew with another stepper of the same recordings."""
         w, before = self.weigher, self.found
-        ranked = sorted(before.estimates, key=before.odds, reverse=True)[:_AGAIN]
-        # What did not converge may promise more than there is; it stays, but nothing falls behind it.
-        sound = [e.log_evidence + before.prices.log(c) for c in ranked for e in before.estimates[c] if e.converged]
-        kept = [c for c in ranked if before.odds(c) > max(sound, default=-np.inf) - _REACH]
+        kept = before.near(_REACH, _AGAIN)
         w.moved_to(stepper, Found(stepper.problem, before.priors, complete=before.complete))
         mine = [c for c in dict.fromkeys([self.base, *kept]) if self._is_mine(c)]
         w.weigh([Start(c, white.z, 0.0) for c in mine if (white := before.of(c, "white"))], whole=True)

@@ -6,7 +6,7 @@ the step then is one of Gauss and Newton, and others follow it, a share of each 
 and doubled where it does.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -20,50 +20,74 @@ from ._weigher import Weigher
 # Remainders of the readings alone. A missing force is fitted as a path, to its end; what a small force that goes with
 # place takes over from the parameters a trajectory without it, about which it would be settled, knows nothing of.
 _KINDS = ("coloured", "clock", "positional", "kinematic", "jitter")
-# Estimates are settled that are within so many nats of the best, so many at most.
+# Estimates are settled that are within so many nats of the best, so many at most; of those with a law apart.
 _REACH, _MOST = 10.0, 12
-# Points that are tried at most; the nats that a settled estimate's further step would bring at most, and those by which
-# a step may miss what it foresaw and be as good as right.
-_POINTS, _SETTLED, _FORESEEN = 60, 0.02, 1.0
+# Of how many others the errors of sensor and clock are tried.
+_ERRORS = 3
+# Points that are tried at most, and the least share of a step; the nats that a settled estimate's further step would
+# bring at most, and those by which a step may miss what it foresaw and be as good as right.
+_POINTS, _SMALLEST, _SETTLED, _FORESEEN = 60, 1e-3, 0.02, 1.0
 # What errors of a clock that are taken as known may owe for others that were weighed with them, in nats: a share of one
 # in six is -1.8, and the rest is for their search, which changes them a little.
 _OWED = (-3.0, 0.0)
 
 
 def settle(weigher: Weigher, is_mine: Callable[[Combination], bool]) -> None:
-    """Settle the likeliest estimates, of the combinations that are the weigher's own."""
-    found, done = weigher.found, set[tuple[Combination, str]]()
-    while len(done) < _MOST:
-        least = max(map(found.odds, found.estimates)) - _REACH
-        near = [max(found.estimates[c], key=lambda e: e.log_evidence) for c in found.estimates if found.odds(c) > least]
+    """Settle the likeliest estimates, of the combinations that are the weigher's own; then those whose clock errs
+    beside each other's errors of it, since a search for these may be caught, and laws would be compared by its luck."""
+    found, done = weigher.found, dict[tuple[Combination, str], float]()
+    while True:
+        full = [law for law in (False, True) if sum(found.has_law(c) is law for c, _ in done) >= _MOST]
+        near = [max(found.estimates[c], key=lambda e: e.log_evidence) for c in found.near(_REACH, _MOST)]
         left = [e for e in near if e.kind in _KINDS and (e.combination, e.kind) not in done and is_mine(e.combination)]
+        left = [e for e in left if found.has_law(e.combination) not in full]
         if not left:
-            return
+            break
         old = max(left, key=lambda e: found.odds(e.combination))
-        done.add((old.combination, old.kind))
-        if (new := settled(weigher, old)) is not None:
+        owed = done[old.combination, old.kind] = _owed(weigher, old)
+        if (new := settled(weigher, old, owed)) is not None:
             found.settle(old, new)
+    _share_clocks(weigher, {c: owed for (c, kind), owed in done.items() if kind == "clock"})
 
 
-def settled(weigher: Weigher, old: Estimate) -> Estimate | None:
+def _share_clocks(weigher: Weigher, owed: Mapping[Combination, float]) -> None:
+    """Settle combinations, which owe so much, beside the errors of sensor and clock of the likeliest others; what is
+    likelier takes their place."""
+    estimates = [one for c in owed if (one := weigher.found.of(c, "clock"))]
+    ranked = sorted(estimates, key=lambda e: -e.log_evidence)
+    errors = list(dict.fromkeys((one.colours, one.clocks) for one in ranked))[:_ERRORS]
+    for old in ranked:
+        own = old.colours, old.clocks
+        other = [settled(weigher, replace(old, colours=colours, clocks=clocks), owed[old.combination])
+                 for colours, clocks in errors if (colours, clocks) != own]  # fmt: skip
+        best = max([old, *filter(None, other)], key=lambda e: e.log_evidence)
+        if best is not old:
+            weigher.found.settle(old, best)
+
+
+def settled(weigher: Weigher, old: Estimate, owed: float | None = None) -> Estimate | None:
     """An estimate about its own optimum; where another form of the same error is likelier there, that one's. None where
-    the evidence is no number at any point."""
-    best = _followed(weigher, old)
+    the evidence is no number at any point.
+
+    `owed` is what it owes for what was weighed with it, where its errors are not those of the clock it was found with.
+    """
+    owed = _owed(weigher, old) if owed is None else owed
+    best = _followed(weigher, old, owed)
     while best is not None and best.converged and best.bends and best.kind != "clock":
         other = weigher.beside(replace(best, bends=()), best.z)
         if other.bends[0].shapes.form is best.bends[0].shapes.form:
             break
-        new = _followed(weigher, other)
+        new = _followed(weigher, other, owed)
         if new is None or not new.log_evidence > best.log_evidence:
             break
         best = new
     return best
 
 
-def _followed(weigher: Weigher, old: Estimate) -> Estimate | None:
+def _followed(weigher: Weigher, old: Estimate, owed: float) -> Estimate | None:
     """An estimate about the best point that steps lead to, with the evidence there; where they come to no end, with a
     nat of what a further one promises, and no more than before. None where the evidence is no number at any point."""
-    origin, share, owed = _allowed(weigher, old), 1.0, 0.0
+    origin, share = _allowed(weigher, old), 1.0
     best = weigher.beside(old, origin)
     white = weigher.found.of(old.combination, "white")
     is_known = old.kind == "clock"  # whose errors are those of the old estimate, and not looked for again
@@ -71,10 +95,8 @@ def _followed(weigher: Weigher, old: Estimate) -> Estimate | None:
         first = weigher.beside(old, white.z)
         if not best.log_evidence > first.log_evidence:  # the step led too far
             best, origin, share = first, white.z, 0.5
-        if is_known:
-            owed = float(np.clip(old.log_evidence - first.log_evidence - first.promised, *_OWED))
     for _ in range(_POINTS):
-        if np.isfinite(best.log_evidence) and best.promised < _SETTLED:
+        if share < _SMALLEST or (np.isfinite(best.log_evidence) and best.promised < _SETTLED):
             break
         z = origin + share * (_allowed(weigher, best) - origin)
         one = weigher.beside(old, z)
@@ -89,6 +111,15 @@ def _followed(weigher: Weigher, old: Estimate) -> Estimate | None:
         return replace(best, log_evidence=value)
     hoped = min(value + min(best.promised, _FORESEEN), old.log_evidence)
     return replace(best, z=origin, log_evidence=hoped, converged=False)
+
+
+def _owed(weigher: Weigher, old: Estimate) -> float:
+    """What errors of a clock that are taken as they are owe for others that were weighed with them."""
+    white = weigher.found.of(old.combination, "white")
+    if old.kind != "clock" or white is None:
+        return 0.0
+    first = weigher.beside(old, white.z)
+    return float(np.clip(old.log_evidence - first.log_evidence - first.promised, *_OWED))
 
 
 def _allowed(weigher: Weigher, estimate: Estimate) -> Float[np.ndarray, " z"]:

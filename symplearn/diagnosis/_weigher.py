@@ -51,8 +51,8 @@ class Weigher:
         self.owed: dict[Combination, float] = {}
         self.owed_along = 0.0
         self.flagged = [np.zeros_like(r.readings, bool) for r in stepper.problem.rows]
-        # Errors of sensor and clock that everything was weighed beside, if any.
-        self.shared: tuple[tuple[Colour, ...], tuple[Colour, ...]] | None = None
+        # Errors of sensor and clock that everything was weighed beside.
+        self.shared: list[tuple[tuple[Colour, ...], tuple[Colour, ...]]] = []
 
     @property
     def problem(self) -> Problem:
@@ -63,7 +63,7 @@ class Weigher:
         self.plain = self.stepper = stepper
         if any(bad.any() for bad in self.flagged):
             self.stepper = stepper.on(stepper.problem.without(self.flagged))
-        self.found, self.shared = found, None
+        self.found, self.shared = found, []
 
     def take_out_outliers(self, fits: Sequence[PathFit], priors: Priors, spared: frozenset[int] = frozenset()) -> bool:
         """Leave out the readings that lie far off the path that is likeliest without them, but for the columns that are
