@@ -16,6 +16,9 @@ _ROUND_OFF = 1e-12
 _CHANCE = 2.5
 # Standard deviations inside a bound beyond which nothing lies.
 _CERTAIN = 8.0
+# Points of a cubature for each dimension: of 144 orthants of up to eight, half of them nearly singular, the logarithm
+# was off by 0.006 at most, as with the million that SciPy would take, for a fifth of a second.
+_POINTS = 2000
 # Standard deviations beyond a bound from which a cubature of the allowed region is no longer to be trusted.
 _FAR = -4.0
 
@@ -122,7 +125,10 @@ def _orthant(reach: np.ndarray, correlation: np.ndarray) -> float:
     Elston 1974).
     """
     if reach.min() >= _FAR:
-        joint = multivariate_normal.cdf(reach, cov=correlation, allow_singular=True, rng=np.random.default_rng(0))
+        some = _POINTS * len(reach)
+        joint = multivariate_normal.cdf(
+            reach, cov=correlation, allow_singular=True, maxpts=some, rng=np.random.default_rng(0)
+        )
         return float(np.log(max(joint, _TINY)))
     return float(orthants(reach, correlation))
 
