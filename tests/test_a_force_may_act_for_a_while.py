@@ -138,6 +138,19 @@ def test_what_a_spell_does_needs_no_effect_beside_it(weighed):
     assert other.found.of((drag,), "spell").log_evidence > other.found.of(both, "spell").log_evidence
 
 
+def test_a_given_noise_stays_as_it_is_given(weighed):
+    """Paths that begin at a fit with twice the given noise end with the given one, and where they end from it: a wrong
+    noise that a force for a while stood beside was called that force."""
+    weigher, starts = weighed
+    doubled = [replace(one, noise=2 * one.noise) for one in starts]
+    given, other = (
+        fit_paths(weigher.stepper, some, weigher.found.priors, weigher.rows, 4) for some in (starts, doubled)
+    )
+    for one, same in zip(given, other, strict=True):
+        assert one.noise == same.noise == 0.01
+        assert one.log_evidence == same.log_evidence
+
+
 def test_a_calm_recording_gains_nothing_by_it(weighed):
     """Where nothing pushes, a force for a while is no likelier than one that is always at work and very weak."""
     p = cases.problem(PENDULUM, [calm(3)], 0.1)

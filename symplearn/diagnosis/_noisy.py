@@ -80,10 +80,12 @@ def _fit_chunk(stepper, fits: list[PathFit], priors: Priors, rows: Sequence[int]
 
 
 def _begun(problem: Problem, fit: PathFit) -> PathFit:
-    """The same with every path beginning at z's own x_0, wherever the rest of it comes from."""
+    """The same with every path beginning at z's own x_0, wherever the rest of it comes from, and a noise that is given
+    as it is given: the start may be of a combination that doubts it."""
     begins = [fit.z[r * problem.state : (r + 1) * problem.state] for r in range(len(fit.paths))]
     paths = [np.concatenate([x[None], path[1:]]) for x, path in zip(begins, fit.paths, strict=True)]
-    return replace(fit, paths=paths)
+    known = problem.noise_of(fit.combination)
+    return replace(fit, paths=paths, noise=np.where(np.isnan(known), fit.noise, known))
 
 
 def _iterate(stepper, fits: list[PathFit], priors: Priors, rows, weight, noisy: bool) -> list[PathFit]:
