@@ -5,10 +5,13 @@ from dataclasses import replace
 import engine_cases as cases
 import numpy as np
 import pytest
+from posterior_cases import found as weighed
+from test_a_clock_at_the_motions_own_period_is_doubted import swinging
 
 from symplearn.diagnosis._ahead import _squares, look_ahead
 from symplearn.diagnosis._calibrate import calibrate
-from symplearn.diagnosis._found import Found
+from symplearn.diagnosis._found import Ahead, Found
+from symplearn.diagnosis._posterior import posterior
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
 from symplearn.diagnosis._weighed import weigh_coloured, weigh_white
@@ -138,3 +141,22 @@ def test_nothing_foretells_what_happens_later():
     assert white[both].log_evidence > white[drag].log_evidence + 20.0
     assert found.ahead[both].score == found.ahead[drag].score
     assert found.ahead[both].holds
+
+
+@pytest.mark.parametrize(
+    ("gain", "holds", "is_better", "counts"),
+    [(20.0, True, False, False), (80.0, True, False, True), (20.0, False, False, True), (20.0, True, True, True)],
+    ids=["dwarfed", "not dwarfed", "nothing goes astray", "it is better"],
+)
+def test_what_holds_as_nothing_does_is_no_finding_beside_ten_times_as_much(gain, holds, is_better, counts):
+    """Of a force that gains 20 nats beside a remainder of 200, both of which go on as they began, nothing is known:
+    unexplained, as where an input drives what is missing. It is a finding if it gains 80, or where nothing goes astray
+    or the force runs on clearly better."""
+    p, one = swinging("periodic_forcing", 1.3)
+    kept = weighed(p, *(replace(one, combination=(), log_evidence=0.0, kind=k) for k in ("white", "clock")))
+    kept.add(replace(one, log_evidence=gain))
+    kept.add(replace(one, log_evidence=gain + 200.0, kind="clock"))
+    kept.ahead = {(): Ahead(-1.0, holds, False), one.combination: Ahead(0.0, True, is_better)}
+    told = posterior(p, kept, 1.0)
+    assert (told.named[0].probability > 0.99) == counts
+    assert (told.unexplained > 0.99) != counts

@@ -25,6 +25,8 @@ _DEAD = 0.1
 CONSISTENT = 0.05
 # Prior share of a remainder beside findings: as many cases as issue 6 would have carry one.
 _BESIDE = 0.25
+# A remainder that gains so many times what the findings do hides what they are.
+_DWARFED = 3.0
 # Constants tell readings as well that are behind by so many nats at most.
 _AS_WELL = 3.0
 # Kinds of remainder other than white noise, which divide its prior among them.
@@ -93,7 +95,7 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
             doubt = 0.0 if any(e.converged for e in estimates) else UNCONVERGED
             price = found.prices.log(combination) - doubt
             # What explains less than it leaves, and was not seen to predict anything, is not what was left out.
-            if found.ahead and not _predicts(problem, found, combination):
+            if found.ahead and not _predicts(problem, found, combination, _is_dwarfed(tempered, least)):
                 other = float(np.logaddexp(other, price + doubtful))
                 total = float(np.logaddexp(plain + np.log(1.0 - _BESIDE), beside))
             named.append((combination, price, total, speaker(estimates)))
@@ -115,13 +117,24 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
     )
 
 
-def _predicts(problem: Problem, found: Found, combination: Combination) -> bool:
+def _predicts(problem: Problem, found: Found, combination: Combination, is_dwarfed: bool) -> bool:
     """Whether a trajectory goes on as it began, or at least better than that of the simulation as it is. The latter
-    does not count where something has the motion's own period, which for a while follows whatever goes with it."""
-    one = found.ahead.get(combination)
-    if one is None or one.holds:
-        return one is not None
+    does not count where something has the motion's own period, which for a while follows whatever goes with it; the
+    former where the simulation as it is goes on, too, as what an input drives does, and a finding is dwarfed by what it
+    leaves: any unknown takes a part of that."""
+    one, bare = found.ahead.get(combination), found.ahead.get(())
+    if one is None:
+        return False
+    if one.holds:
+        return one.is_better or not (is_dwarfed and bare is not None and bare.holds)
     return one.is_better and not in_tune(problem, speaker(found.estimates[combination]))
+
+
+def _is_dwarfed(tempered: Mapping[str, float], least: float) -> bool:
+    """Whether the remainder beside a combination gains far more than the combination does over `least`."""
+    white = tempered.get("white", -np.inf)
+    rest = max((value for kind, value in tempered.items() if kind != "spell"), default=-np.inf)
+    return bool(rest - white > _DWARFED * (white - least))
 
 
 @np.errstate(invalid="ignore")  # where neither has an evidence, which gains more does not matter
