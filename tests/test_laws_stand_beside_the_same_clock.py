@@ -92,4 +92,5 @@ def test_what_a_search_was_caught_in_is_left_where_laws_are_settled(weigher):
     found.add(caught)
     settle(weigher, lambda combination: True)
     assert found.of(damping, "clock").clocks == best.clocks
-    assert found.of(damping, "clock").log_evidence > good.log_evidence - 3.0  # what it may owe for others
+    # It may owe 3.0 nats for what it was weighed with. Seen: 0.39 less.
+    assert found.of(damping, "clock").log_evidence > good.log_evidence - 3.0

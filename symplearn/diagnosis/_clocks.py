@@ -62,8 +62,7 @@ def _leaders(found: Found) -> list[Estimate]:
     """The likeliest estimate of this kind, and the likeliest with a word for everything."""
     every = [one for estimates in found.estimates.values() for one in estimates if one.kind == "clock"]
     worded = [one for one in every if not found.has_law(one.combination)]
-    best = [max(some, key=lambda one: one.log_evidence) for some in (every, worded) if some]
-    return best[:1] if best[:1] == best[1:] else best
+    return list(dict.fromkeys(max(some, key=lambda one: one.log_evidence) for some in (every, worded) if some))
 
 
 def _likeliest(found: Found) -> Estimate | None:

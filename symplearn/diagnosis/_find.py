@@ -47,7 +47,7 @@ def searched(
         search, rebuild, steps = _begun(file, recordings, options, deadline)
     weigh_nameless(file, recordings, options, search, steps[0])
     likeliest = max(search.found.estimates, key=search.found.odds)
-    if any(search.problem.candidate(m).nameless for m in likeliest):  # its shape may pass faster than the motion
+    if search.found.has_law(likeliest):  # its shape may pass faster than the motion
         steps = _refined(search, lambda longest: rebuild(longest, search.problem.equations), steps, options)
     search.settle()
     found = search.found

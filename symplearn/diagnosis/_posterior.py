@@ -130,6 +130,7 @@ def _predicts(problem: Problem, found: Found, combination: Combination, is_dwarf
     return one.is_better and not in_tune(problem, speaker(found.estimates[combination]))
 
 
+@np.errstate(invalid="ignore")  # where neither has an evidence, nothing is dwarfed
 def _is_dwarfed(tempered: Mapping[str, float], least: float) -> bool:
     """Whether the remainder beside a combination gains far more than the combination does over `least`."""
     white = tempered.get("white", -np.inf)

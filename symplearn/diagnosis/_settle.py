@@ -6,7 +6,7 @@ the step then is one of Gauss and Newton, and others follow it, a share of each 
 and doubled where it does.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,7 +35,7 @@ _OWED = (-3.0, 0.0)
 def settle(weigher: Weigher, is_mine: Callable[[Combination], bool]) -> None:
     """Settle the likeliest estimates, of the combinations that are the weigher's own; then those whose clock errs
     beside each other's errors of it, since a search for these may be caught, and laws would be compared by its luck."""
-    found, done = weigher.found, dict[tuple[Combination, str], float]()
+    found, done = weigher.found, set[tuple[Combination, str]]()
     while True:
         full = [law for law in (False, True) if sum(found.has_law(c) is law for c, _ in done) >= _MOST]
         near = [max(found.estimates[c], key=lambda e: e.log_evidence) for c in found.near(_REACH, _MOST)]
@@ -44,50 +44,46 @@ def settle(weigher: Weigher, is_mine: Callable[[Combination], bool]) -> None:
         if not left:
             break
         old = max(left, key=lambda e: found.odds(e.combination))
-        owed = done[old.combination, old.kind] = _owed(weigher, old)
-        if (new := settled(weigher, old, owed)) is not None:
+        done.add((old.combination, old.kind))
+        if (new := settled(weigher, old)) is not None:
             found.settle(old, new)
-    _share_clocks(weigher, {c: owed for (c, kind), owed in done.items() if kind == "clock"})
+    clocks = [found.of(c, kind) for c, kind in done if kind == "clock"]
+    _share_clocks(weigher, [one for one in clocks if one is not None and one.owed is not None])
 
 
-def _share_clocks(weigher: Weigher, owed: Mapping[Combination, float]) -> None:
-    """Settle combinations, which owe so much, beside the errors of sensor and clock of the likeliest others; what is
-    likelier takes their place."""
-    estimates = [one for c in owed if (one := weigher.found.of(c, "clock"))]
+def _share_clocks(weigher: Weigher, estimates: Sequence[Estimate]) -> None:
+    """Settle estimates once more beside the errors of sensor and clock of the likeliest others; what is likelier takes
+    their place."""
     ranked = sorted(estimates, key=lambda e: -e.log_evidence)
     errors = list(dict.fromkeys((one.colours, one.clocks) for one in ranked))[:_ERRORS]
     for old in ranked:
         own = old.colours, old.clocks
-        other = [settled(weigher, replace(old, colours=colours, clocks=clocks), owed[old.combination])
+        other = [settled(weigher, replace(old, colours=colours, clocks=clocks))
                  for colours, clocks in errors if (colours, clocks) != own]  # fmt: skip
         best = max([old, *filter(None, other)], key=lambda e: e.log_evidence)
         if best is not old:
             weigher.found.settle(old, best)
 
 
-def settled(weigher: Weigher, old: Estimate, owed: float | None = None) -> Estimate | None:
+def settled(weigher: Weigher, old: Estimate) -> Estimate | None:
     """An estimate about its own optimum; where another form of the same error is likelier there, that one's. None where
-    the evidence is no number at any point.
-
-    `owed` is what it owes for what was weighed with it, where its errors are not those of the clock it was found with.
-    """
-    owed = _owed(weigher, old) if owed is None else owed
-    best = _followed(weigher, old, owed)
+    the evidence is no number at any point."""
+    best = _followed(weigher, old)
     while best is not None and best.converged and best.bends and best.kind != "clock":
         other = weigher.beside(replace(best, bends=()), best.z)
         if other.bends[0].shapes.form is best.bends[0].shapes.form:
             break
-        new = _followed(weigher, other, owed)
+        new = _followed(weigher, other)
         if new is None or not new.log_evidence > best.log_evidence:
             break
         best = new
     return best
 
 
-def _followed(weigher: Weigher, old: Estimate, owed: float) -> Estimate | None:
+def _followed(weigher: Weigher, old: Estimate) -> Estimate | None:
     """An estimate about the best point that steps lead to, with the evidence there; where they come to no end, with a
     nat of what a further one promises, and no more than before. None where the evidence is no number at any point."""
-    origin, share = _allowed(weigher, old), 1.0
+    origin, share, owed = _allowed(weigher, old), 1.0, old.owed
     best = weigher.beside(old, origin)
     white = weigher.found.of(old.combination, "white")
     is_known = old.kind == "clock"  # whose errors are those of the old estimate, and not looked for again
@@ -95,6 +91,8 @@ def _followed(weigher: Weigher, old: Estimate, owed: float) -> Estimate | None:
         first = weigher.beside(old, white.z)
         if not best.log_evidence > first.log_evidence:  # the step led too far
             best, origin, share = first, white.z, 0.5
+        if is_known and owed is None:
+            owed = float(np.clip(old.log_evidence - first.log_evidence - first.promised, *_OWED))
     for _ in range(_POINTS):
         if share < _SMALLEST or (np.isfinite(best.log_evidence) and best.promised < _SETTLED):
             break
@@ -106,20 +104,11 @@ def _followed(weigher: Weigher, old: Estimate, owed: float) -> Estimate | None:
             share /= 2
     if not np.isfinite(best.log_evidence):
         return None
-    value = best.log_evidence + owed
+    value = best.log_evidence + (owed or 0.0)
     if best.promised < _SETTLED:
-        return replace(best, log_evidence=value)
+        return replace(best, log_evidence=value, owed=owed)
     hoped = min(value + min(best.promised, _FORESEEN), old.log_evidence)
-    return replace(best, z=origin, log_evidence=hoped, converged=False)
-
-
-def _owed(weigher: Weigher, old: Estimate) -> float:
-    """What errors of a clock that are taken as they are owe for others that were weighed with them."""
-    white = weigher.found.of(old.combination, "white")
-    if old.kind != "clock" or white is None:
-        return 0.0
-    first = weigher.beside(old, white.z)
-    return float(np.clip(old.log_evidence - first.log_evidence - first.promised, *_OWED))
+    return replace(best, z=origin, log_evidence=hoped, converged=False, owed=owed)
 
 
 def _allowed(weigher: Weigher, estimate: Estimate) -> Float[np.ndarray, " z"]:

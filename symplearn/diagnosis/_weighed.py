@@ -64,6 +64,7 @@ class Estimate:
     modes: tuple[Mode, ...] = ()  # all optima that were found, this one among them
     outliers: tuple[tuple[float, float], ...] = ()  # share and size by channel, where they were left out
     promised: float = 0.0  # nats that the step to it is to bring, beside a remainder
+    owed: float | None = None  # nats added for what its errors of a clock were weighed with, once it is settled
     log_likelihood: float = np.nan  # of the readings at `z`, of a trajectory fit
 
     @property
