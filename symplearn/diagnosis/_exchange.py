@@ -20,8 +20,9 @@ from ._strength import mixture_gain
 from ._trajectory import LANES, Stepper
 from ._whitening import Whiten
 
-# Effects that triples are formed of, and subsets of which every order of magnitude is weighed.
-_THREES, _WEIGHED = 24, 60
+# Effects that subsets of three and more are formed of, some 2000 of them, and subsets of which every order of magnitude
+# is weighed.
+_FORMED, _WEIGHED = {3: 24, 4: 16, 5: 14}, 60
 # Of a Gram matrix.
 _ROUND_OFF = 1e-12
 
@@ -87,9 +88,11 @@ class Regression:
         self.gram = some @ some.T - cross.T @ self.follow
         self.gram[0, 0] += float(precision @ off**2)
 
-    def subsets(self, size: int, is_known: Callable[[Combination], bool], most: int) -> list[Start]:
-        """The best combinations of a size that are not known, by what they gain on the fitted one."""
-        return self._best(self._choices(size - len(self.kept)), is_known, most)
+    def subsets(
+        self, size: int, is_known: Callable[[Combination], bool], most: int, among: Callable[[int], bool] | None = None
+    ) -> list[Start]:
+        """The best combinations of a size that are not known, of some members, by what they gain on the fitted one."""
+        return self._best(self._choices(size - len(self.kept), among), is_known, most)
 
     def with_one_more(self, size: int, is_known: Callable[[Combination], bool], most: int) -> list[Start]:
         """The same of some of the fitted effects with one that is not among them."""
@@ -114,13 +117,14 @@ class Regression:
     def _members(self, chosen: Sequence[int]) -> Combination:
         return tuple(sorted(self.responses[k].member for k in {*self.kept, *chosen}))
 
-    def _choices(self, number: int) -> Iterator[tuple[int, ...]]:
-        """So many of the effects; where they are three, of those that do best in pairs."""
-        some = [k for k in range(len(self.responses)) if k not in self.kept]
-        if number >= 3:
-            pairs = [one for c in itertools.combinations(some, 2) if (one := self._solved(c)) is not None]
-            ranked = sorted(pairs, key=lambda one: -one.gain)
-            some = sorted(list(dict.fromkeys(k for one in ranked for k in one.chosen))[:_THREES])
+    def _choices(self, number: int, among: Callable[[int], bool] | None) -> Iterator[tuple[int, ...]]:
+        """So many of the effects; where they are three and more, of those that do best with one fewer."""
+        some = [k for k, one in enumerate(self.responses) if k not in self.kept
+                and (among is None or among(one.member))]  # fmt: skip
+        for size in range(3, number + 1):
+            fewer = [one for c in itertools.combinations(some, size - 1) if (one := self._solved(c)) is not None]
+            ranked = sorted(fewer, key=lambda one: -one.gain)
+            some = sorted(list(dict.fromkeys(k for one in ranked for k in one.chosen))[: _FORMED[size]])
         for chosen in itertools.combinations(some, number):
             if self._is_possible(chosen):
                 yield chosen

@@ -140,6 +140,11 @@ class Found:
         """The largest log evidence of a combination over kinds."""
         return max((e.log_evidence for e in self.estimates[combination]), default=-np.inf)
 
+    def white(self, combination: Combination) -> float:
+        """Log evidence of a combination under white noise alone."""
+        one = self.of(combination, "white")
+        return -np.inf if one is None else one.log_evidence
+
     @cached_property
     def prices(self) -> Prices:
         """The prior of every combination."""

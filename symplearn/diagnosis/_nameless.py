@@ -16,7 +16,7 @@ from ._memories import memories
 from ._options import Options
 from ._outlook import Outlook
 from ._posterior import CONSISTENT, Posterior, posterior
-from ._problem import MOST, Combination
+from ._problem import USUAL, Combination
 from ._prospects import promising
 from ._score import Start
 from ._search import Search
@@ -65,7 +65,7 @@ def weigh_nameless(
     if not outlooks or not search.in_time() or not _is_open(_odds(search), search.found):
         return
     options.progress("looking for an expression of the missing force")
-    some = proposals(file, outlooks, strained_coordinates(outlooks))[: MOST - len(search.base)]
+    some = proposals(file, outlooks, strained_coordinates(outlooks))[: USUAL - len(search.base)]
     usable = begun.usable([one.force for one in some])
     if proposed := [one for one in some if one.force in usable]:
         begun.extend([*known, *(one.force for one in proposed)])
@@ -115,7 +115,7 @@ def _weigh_memories(search: Search, members: Sequence[int]) -> None:
     """Combinations of what was found and a force that fades, from where scores put them, or alone."""
     search.progress("weighing forces that remember")
     found, promises = search.found, dict[Combination, tuple[float, Start]]()
-    bases = [c for c in _leaders(search) if len(c) < MOST]
+    bases = [c for c in _leaders(search) if len(c) < search.weigher.most]
     for c in bases:
         white = found.of(c, "white")
         assert white is not None  # leaders are weighed under white noise
@@ -139,7 +139,7 @@ def _weigh_beside_laws(search: Search, members: Sequence[int]) -> None:
     """A second effect beside the best answer, if that has a law."""
     found = search.found
     best = max(found.estimates, key=found.odds)
-    if set(best) & set(members) and len(best) < MOST and search.in_time():
+    if set(best) & set(members) and len(best) < search.weigher.most and search.in_time():
         further = sorted(search.prospects.about(best, _PLACES), key=lambda s: -s.gain - found.prices.log(s.combination))
         more = [s for s in further if s.gain > _WORTH and s.combination not in found.estimates][:_BESIDE]
         if more:
@@ -197,7 +197,7 @@ def _promising(search: Search, members: Sequence[int]) -> list[Start]:
     for c in _leaders(search):
         white = found.of(c, "white")
         assert white is not None  # every combination is weighed under white noise first
-        for size in range(1, min(len(c) + 1, MOST) - len(search.base) + 1):
+        for size in range(1, min(len(c) + 1, search.weigher.most) - len(search.base) + 1):
             for s in search.prospects.with_one_of(c, members, size, _MOST):
                 promise = white.log_evidence + s.gain + found.prices.log(s.combination)
                 if promise > promises.get(s.combination, (-np.inf, s))[0]:
@@ -212,7 +212,7 @@ def _leaders(search: Search) -> list[Combination]:
     """The likeliest combinations of each size."""
     found, base = search.found, search.base
     ranked = sorted((c for c in found.estimates if set(base) <= set(c)), key=found.odds, reverse=True)
-    sizes = [[c for c in ranked if len(c) == size] for size in range(len(base), MOST + 1)]
+    sizes = [[c for c in ranked if len(c) == size] for size in range(len(base), search.weigher.most + 1)]
     near = [c for some in sizes for c in some[:_BASES] if found.odds(c) > found.odds(ranked[0]) - _REACH]
     return [c for c in near if found.of(c, "white")]
 
@@ -225,8 +225,7 @@ def _is_near(search: Search) -> bool:
 
 def _white_odds(found: Found, combination: Combination) -> float:
     """What a combination's probability goes with under white noise alone."""
-    white = found.of(combination, "white")
-    return -np.inf if white is None else white.log_evidence + found.prices.log(combination)
+    return found.white(combination) + found.prices.log(combination)
 
 
 def _weigh_beside_remainders(search: Search, members: Sequence[int]) -> None:
@@ -269,7 +268,7 @@ def _is_open(odds: Posterior, found: Found) -> bool:
     if not odds.named or odds.unexplained >= odds.named[0].probability:
         return True
     best = odds.named[0].best
-    return not found.has_law(best.combination) and (len(best.combination) == MOST or is_clear(found, best))
+    return not found.has_law(best.combination) and (len(best.combination) >= USUAL or is_clear(found, best))
 
 
 def is_clear(found: Found, best: Estimate) -> bool:

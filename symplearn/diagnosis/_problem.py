@@ -18,9 +18,10 @@ from .._augmented import Equations
 from .._effects import HIDDEN, NOISE, Candidate, Oscillating
 from .._rows import Rows
 
-MOST = 3  # effects in the largest combination
+MOST = 5  # effects in the largest combination
+USUAL = 3  # and in the largest where these do not leave more to be told
 _FEW = 4  # recordings of which an effect may be in any
-SLOTS = 9  # values of the largest combination: three of three each
+SLOTS = 9  # values of the largest combination: three of three each, or five of fewer
 
 # Numbers of members of a problem, in increasing order: effects on targets, in all recordings or in some.
 Combination = tuple[int, ...]

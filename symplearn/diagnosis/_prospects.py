@@ -40,6 +40,8 @@ class Prospects:
         ran away."""
         white = self.weigher.found.of(combination, "white")
         assert white is not None  # every combination is weighed under white noise first
+        if len(combination) >= self.weigher.most:
+            return []
         key = combination, white.log_evidence, most
         if key not in self._known:
             fits = self._fitted(combination)
@@ -67,18 +69,20 @@ class Prospects:
         return [unit for m in members for unit in grid(self.weigher.problem, self.weigher.found.priors, m)]
 
     def exchanged(
-        self, combination: Combination, most: int, size: int, number: int, beside: Estimate | None = None
-    ) -> list[Start]:
+        self, combination: Combination, most: int, size: int, number: int, beside: Estimate | None = None,
+        plainly: bool = False,
+    ) -> list[Start]:  # fmt: skip
         """Combinations of a size, at most so many, that may do as well as a fitted one, whose members they need not
         have: of all effects without a place, in all recordings or in the same as one of its members, and of others
         where one more of them helps most. `beside` the remainder of an estimate, if any: those too that were weighed
-        without it."""
+        without it. `plainly`: of none at a place."""
         w, fits = self.weigher, self._fitted(combination)
         if fits is None:
             return []
         problem = w.problem
         units = {m: Unit(problem.whole(m), None) for m in self._without_a_place(combination)}
-        for start in sorted(self.about(combination, most), key=lambda start: -start.gain)[:_EXCHANGED]:
+        placed = [] if plainly else self.about(combination, most)
+        for start in sorted(placed, key=lambda start: -start.gain)[:_EXCHANGED]:
             (member,) = set(start.combination) - set(combination)
             place = dict(problem.placed(start.combination))[member].stop - 1
             is_placed = bool(problem.candidate(member).effect.places)
@@ -90,7 +94,11 @@ class Prospects:
         whiten = whitening(problem, fits, w.rows, beside) if beside else None
         regression = Regression(w.stepper, fits, w.rows, w.found.priors, some, whiten)
         known = [c for c in w.found.estimates if beside is None or w.found.of(c, beside.kind)]
-        return regression.subsets(size + len(w.base), set(known).__contains__, number)
+        among = self._is_plain if plainly else None
+        return regression.subsets(size + len(w.base), set(known).__contains__, number, among)
+
+    def _is_plain(self, member: int) -> bool:
+        return not self.weigher.problem.candidate(member).effect.places
 
     def _without_a_place(self, combination: Combination) -> list[int]:
         """Effects without a place, in all recordings or in the same as one of a combination's members."""

@@ -13,7 +13,7 @@ from ._driven import as_driven
 from ._found import Found, speaker
 from ._gaps import across_gaps
 from ._modes import along_the_modes
-from ._problem import MOST, Combination, Problem
+from ._problem import Combination, Problem
 from ._prospects import MANY, Prospects
 from ._scan import ends, spacing
 from ._score import Start, inverse
@@ -126,7 +126,7 @@ class Refinement:
         """What may do as well as the likeliest of every size: some fell behind on the way, from where they began."""
         self.progress("weighing what may do as well")
         base = len(self.weigher.base)
-        for size in range(1, MOST - base + 1):
+        for size in range(1, self.weigher.most - base + 1):
             mine = [c for c in self._mine() if len(c) == size + base]
             best = max(mine, key=self.found.odds, default=None)
             if best is not None and self.found.odds(best) > max(map(self.found.odds, self._mine())) - _NEAR:
@@ -136,6 +136,11 @@ class Refinement:
         """Combinations of a size that may do as well as the best one, from where a regression about it puts them."""
         starts = [s for s in self.prospects.exchanged(combination, MANY, size, number) if s.gain > -_BEHIND]
         if starts:  # from a trajectory that all rows are near to
+            self.weigher.weigh(starts, whole=True)
+
+    def weigh_plain(self, combination: Combination, size: int, number: int) -> None:
+        """Of effects without a place, combinations of a size that come nearest to what one with them does."""
+        if starts := self.prospects.exchanged(combination, MANY, size, number, plainly=True):
             self.weigher.weigh(starts, whole=True)
 
     def weigh_beside_the_remainder(self) -> None:
@@ -149,7 +154,7 @@ class Refinement:
         some: dict[Combination, Start] = {}
         for c in self._bases([c for c in ranked if self.found.odds(c) > top - _BEHIND]):
             least = top - self.found.odds(c) - 2 * _NEAR
-            for size in range(len(c), min(len(c) + 1, MOST) + 1):
+            for size in range(len(c), min(len(c) + 1, self.weigher.most) + 1):
                 alike = self.prospects.exchanged(c, MANY, size - len(self.weigher.base), _ALIKE, rest)
                 some |= {start.combination: start for start in alike if start.gain > least}
         if new := [start for c, start in some.items() if c not in self.found.estimates]:
@@ -161,7 +166,7 @@ class Refinement:
     def _bases(self, ranked: Sequence[Combination]) -> list[Combination]:
         """The best of every size, and the best without an unseen oscillator, which no exchange takes out."""
         found = []
-        for size in range(1, MOST + 1):
+        for size in range(1, self.weigher.most + 1):
             mine = [c for c in ranked if len(c) == size and c != self.weigher.base]
             seen = [c for c in mine if not any(self.problem.candidate(m).effect.switched for m in c)]
             found += [*mine[:1], *seen[:1]]
@@ -184,7 +189,7 @@ class Refinement:
         those: what was weighed already may have been caught in a poorer optimum, which would make the member look
         needed."""
         tried, base = set[Combination](), self.weigher.base
-        for _ in range(MOST - 1):
+        for _ in range(self.weigher.most - 1):
             ranked = sorted(filter(self._is_worth_it, self.found.estimates), key=self.found.best, reverse=True)[:KEPT]
             less = dict.fromkeys(c[:k] + c[k + 1 :] for c in ranked for k in range(len(c)) if c[k] not in base)
             some = [c for c in less if c not in tried

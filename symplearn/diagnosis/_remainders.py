@@ -6,7 +6,7 @@ import numpy as np
 
 from ._clocks import share_clocks, weigh_clocks
 from ._found import Found
-from ._problem import MOST, Combination
+from ._problem import Combination
 from ._weigher import KEPT, Weigher
 
 # Combinations this many nats behind the best are tried beside a remainder.
@@ -75,5 +75,5 @@ class Remainders:
 
     def _of_each_size(self, most: int) -> list[Combination]:
         """The best of each size, outliers that are taken out aside."""
-        sizes = [len(self.weigher.base) + size for size in range(1, MOST)]
+        sizes = [len(self.weigher.base) + size for size in range(1, self.weigher.most)]
         return [c for size in sizes for c in [c for c in self._ranked() if len(c) == size][:most]]

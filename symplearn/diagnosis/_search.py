@@ -1,4 +1,5 @@
-"""The search: nothing left out, single effects, pairs, triples; each fitted, and weighed under every remainder."""
+"""The search: nothing left out, single effects, pairs, triples, and more where these leave more to be told; each
+fitted, and weighed under every remainder."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -11,9 +12,10 @@ from ._beginning import STARTS, Beginning
 from ._calibrate import Priors
 from ._clocks import share_clocks
 from ._found import Found
+from ._larger import Larger
 from ._noisy import fit_paths
 from ._null_paths import beside
-from ._problem import MOST, Combination, Problem
+from ._problem import MOST, USUAL, Combination, Problem
 from ._prospects import MANY, Prospects, promising
 from ._refinement import Refinement
 from ._remainders import Remainders
@@ -27,8 +29,8 @@ from ._weigher import KEPT, Weigher
 # Combinations of one size are carried on to the next size while within this many nats of the best; where a missing
 # force leads by no more, what is left out is small.
 _REACH = 30.0
-# Combinations that are extended, most larger ones that are fitted, and what a larger one must gain to go on.
-_BASES, _PAIRS, _WORTH = 4, 32, 2.0
+# What a larger combination must gain to go on.
+_WORTH = 2.0
 # How many effects are fitted where they are small, and how often the same at other places or in other recordings.
 _SMALL, _ALIKE = 24, 4
 # Combinations that a missing force is tried beside.
@@ -37,9 +39,9 @@ _FORCED = 6
 _BATCH = 32
 # Combinations that are weighed again in finer steps.
 _AGAIN = 24
-# Places at which an effect is tried beside others than the best of the size below.
+# Places at which an effect is tried along a path.
 _FEW = 60
-_ONE_MORE = {1: "one effect", 2: "a second effect", 3: "a third effect"}
+_ONE_MORE = {1: "one effect", 2: "a second effect", 3: "a third effect", 4: "a fourth effect", 5: "a fifth effect"}
 
 
 class Search:
@@ -55,7 +57,7 @@ class Search:
         self.beginning = Beginning(self.weigher, seeds, progress, spared)
         self.prospects = Prospects(self.weigher)
         self.refinement = Refinement(self.prospects, progress)
-        self.remainders = Remainders(self.weigher, progress)
+        self.remainders, self.larger = Remainders(self.weigher, progress), Larger(self.refinement)
 
     @property
     def found(self) -> Found:
@@ -80,10 +82,13 @@ class Search:
         for size in range(1, MOST - len(self.base) + 1):
             if size > 1 and not self.in_time():
                 break
+            if size + len(self.base) > USUAL and not self._is_worth_more(size - 1):
+                break
+            self.weigher.most = max(USUAL, size + len(self.base))
             self.progress(f"looking where {_ONE_MORE[size]} would help")
             if size == 1:
                 self._weigh_singles()
-            elif starts := self._proposals(size):
+            elif starts := self.larger.starts(size):
                 self._weigh_in_batches(starts, self._is_near(size - 1))
             else:
                 break
@@ -115,7 +120,7 @@ class Search:
         mine = [c for c in dict.fromkeys([self.base, *kept]) if self._is_mine(c)]
         w.weigh([Start(c, white.z, 0.0) for c in mine if (white := before.of(c, "white"))], whole=True)
         white = before.of(self.base, "white")
-        if white is not None and self.white(self.base) < white.log_evidence - _REACH:
+        if white is not None and self.found.white(self.base) < white.log_evidence - _REACH:
             # What goes round once more between two readings looks alike in coarse steps.
             w.weigh([Start(self.base, self.beginning.bare(z), 0.0) for z in self.beginning.seeds[:STARTS]])
         if self.in_time():
@@ -153,6 +158,7 @@ class Search:
         ]
         self.prospects, self.remainders = Prospects(w), Remainders(w, self.progress)
         self.refinement = Refinement(self.prospects, self.progress)
+        self.larger = Larger(self.refinement)
 
     def _refine(self) -> None:
         """The best once more from elsewhere, with what may do as well, and with what is left without a member."""
@@ -173,35 +179,6 @@ class Search:
         if time.monotonic() > self.deadline:
             self.found.complete = False
         return self.found.complete
-
-    def _proposals(self, size: int) -> list[Start]:
-        """Where fits of combinations of one size begin: each of the best of the size below with one effect more."""
-        best = [c for c in self.found.estimates if self._size(c) == size - 1]
-        best = sorted(best, key=self.found.best, reverse=True)
-        top = self.found.best(best[0]) if best else -np.inf
-        kept: dict[tuple[Combination, int], Start] = {}
-        near = [c for c in best if self.found.best(c) > top - _REACH][:_BASES]
-        # What an error of the sensor hides, an effect less, shows where there is none.
-        plain = sorted(best, key=self.white, reverse=True)[:1]
-        for k, c in enumerate(dict.fromkeys([*near, *plain])):
-            white = self.found.of(c, "white")
-            assert white is not None  # every combination is weighed under white noise first
-            # Thinned frequencies miss an oscillation that stays in tune throughout, so the best one has more of them.
-            mine = self.prospects.about(c, _FEW if k else MANY)
-            promised = [replace(start, gain=start.gain + white.log_evidence) for start in mine]
-            # As many of each: what a score promises about a poor fit is too much.
-            self._keep(promised, kept)
-            if not k:
-                self.refinement.weigh_exchanged(c, size, _PAIRS // _BASES)
-        return sorted(kept.values(), key=lambda start: -start.gain)
-
-    def _keep(self, listed: Sequence[Start], kept: dict[tuple[Combination, int], Start]) -> None:
-        """Add the best of some starts, each combination from two places at most."""
-        most = len(kept) + _PAIRS // _BASES
-        for start in sorted(listed, key=lambda start: -start.gain):
-            tried = sum(combination == start.combination for combination, _ in kept)
-            if tried < 2 and len(kept) < most and start.combination not in self.found.estimates:
-                kept[start.combination, tried] = start
 
     def _weigh_singles(self) -> None:
         """Every effect alone, however little time there is for those of the highest scores.
@@ -298,13 +275,14 @@ class Search:
         mine = [c for c in self.found.estimates if self._size(c) == size]
         return any(
             max(map(value, mine), default=-np.inf) > max(map(value, smaller)) + least
-            for value, least in ((self.found.best, _WORTH), (self.white, _REACH))
+            for value, least in ((self.found.best, _WORTH), (self.found.white, _REACH))
         )
 
-    def white(self, combination: Combination) -> float:
-        """Log evidence of a combination under white noise alone."""
-        one = self.found.of(combination, "white")
-        return -np.inf if one is None else one.log_evidence
+    def _is_worth_more(self, size: int) -> bool:
+        """Whether the likeliest has so many effects, and the last of them is worth more than it costs."""
+        mine = [self.found.odds(c) for c in self.found.estimates if self._size(c) == size]
+        less = [self.found.odds(c) for c in self.found.estimates if self._size(c) < size]
+        return max(mine, default=-np.inf) > max(less) + _WORTH
 
     def _weigh_remainders(self) -> None:
         """Errors of the clock, and forces that go with place, beside the best combinations."""

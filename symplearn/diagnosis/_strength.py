@@ -12,9 +12,6 @@ they have that share of the prior which the one has alone that is shown best: wi
 not the likelier for what it could have been without being seen.
 """
 
-import itertools
-from functools import lru_cache
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import log_ndtr, logsumexp
@@ -24,6 +21,7 @@ from .._effects import EXCITATION
 from ._activity import log_fed
 from ._calibrate import Priors
 from ._evidence import cut_off, log_density
+from ._mixture import over_choices, over_widest
 from ._problem import Combination, Problem
 from ._squares import log_product_of_squares
 
@@ -160,27 +158,25 @@ def mixture_gains(
     along = np.einsum("lij,li->lj", vectors, np.where(sound[:, None], centre, 0.0))
     if effects == 1 and a > _MANY:
         widths = np.concatenate([_shares(values, alone), np.ones((len(centre), 1))], axis=1)
-        return _gains(_log_weights_of_one(vectors, bare, along / left, widths, lowest, alone), sound)
+        return _sound(over_widest(_log_weights_of_one(vectors, bare, along / left, widths, lowest, alone)), sound)
     likelihood = (vectors * bare[:, None]) @ vectors.mT
     told = np.einsum("lij,lj->li", vectors, along / left)
     parts = [_eigenvalues(spread[:, own == k][:, :, own == k]) for k in range(effects)]
     shares = np.stack([_shares(part, alone) for part in parts], axis=1)
-    choices = _choices(shares.shape[-1], effects)
-    widths = shares[:, np.arange(effects), choices][..., own]
-    # The widest priors last, whose effects may be too weak to be seen.
-    every = np.concatenate([widths, np.ones((len(centre), 1, a))], axis=1)
-    return _gains(_log_weights(told, likelihood, every, lowest, own, alone), sound)
+
+    def weighed(choices: Int[np.ndarray, "_ choice effect"]) -> Float[np.ndarray, "lane weighed"]:
+        widths = shares[np.arange(len(choices))[:, None, None], np.arange(effects), choices][..., own]
+        # The widest priors last, whose effects may be too weak to be seen.
+        every = np.concatenate([widths, np.ones((len(centre), 1, a))], axis=1)
+        return _log_weights(told, likelihood, every, lowest, own, alone)
+
+    squares = np.where(sound[:, None], centre, 0.0) ** 2
+    sizes = np.sqrt(np.stack([squares[:, own == k].mean(1) for k in range(effects)], axis=1))
+    return _sound(over_choices(weighed, shares, sizes), sound)
 
 
-def _gains(logs: Float[np.ndarray, "lane choice"], sound: Bool[np.ndarray, " lane"]) -> Float[np.ndarray, " lane"]:
-    """What all choices of widths gain over the widest, which is the last."""
-    gains = np.logaddexp.reduce(logs[:, :-1], axis=1) - np.log(logs.shape[1] - 1) - logs[:, -1]
+def _sound(gains: Float[np.ndarray, " lane"], sound: Bool[np.ndarray, " lane"]) -> Float[np.ndarray, " lane"]:
     return np.where(sound & np.isfinite(gains), gains, 0.0)
-
-
-@lru_cache
-def _choices(widths: int, effects: int) -> Int[np.ndarray, "choice effect"]:
-    return np.array(list(itertools.product(range(widths), repeat=effects)))
 
 
 def _eigenvalues(matrices: Float[np.ndarray, "lane b b"]) -> Float[np.ndarray, "lane b"]:

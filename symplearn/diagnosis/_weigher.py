@@ -15,7 +15,7 @@ from ._found import Found
 from ._jitter import weigh_jitter
 from ._noisy import PathFit, fit_paths
 from ._positional import weigh_positional
-from ._problem import MOST, Combination, Problem
+from ._problem import USUAL, Combination, Problem
 from ._scatter import law_gain, outlier_evidence, outliers, suspects
 from ._score import Start
 from ._start import windows
@@ -46,6 +46,8 @@ class Weigher:
         self.found = found
         self.rows = [r.fitted for r in stepper.problem.rows]
         self.base: Combination = ()
+        # Effects in the largest combination that is tried.
+        self.most = USUAL
         # Log evidence of the readings that were taken out: by the errors of each white fit, and by those of the path
         # that they were found to lie off.
         self.owed: dict[Combination, float] = {}
@@ -89,7 +91,7 @@ class Weigher:
             self.flagged[r][: len(bad)] = bad
         some = np.any([bad.any(0) for bad in self.flagged], axis=0)
         self.stepper = self.plain.on(problem.without(self.flagged)) if some.any() else self.plain
-        self.base = tuple(sorted(m for j, m in columns.items() if some[j]))[: MOST - 1]
+        self.base = tuple(sorted(m for j, m in columns.items() if some[j]))[: USUAL - 1]
         self.owed_along = self._path_owed(best, self.base) if self.base else 0.0
         return bool(some.any())
 
