@@ -60,6 +60,21 @@ def test_many_larger_combinations_displace_no_likelier_one(damped):
 
 
 @pytest.mark.slow
+def test_what_each_member_is_worth_is_known_in_finer_steps(damped):
+    """Of a pair that is hundreds of nats ahead both singles are weighed in finer steps, too."""
+    before = dict(damped.found.estimates)
+    pair = tuple(sorted(member(damped, name) for name in ("viscous_damping", "quadratic_stiffness")))
+    white = damped.found.of(pair[:1], "white") or damped.found.of(pair[1:], "white")
+    for c in (pair[:1], pair[1:]):
+        damped.found.estimates[c] = [replace(white, combination=c)]
+    damped.found.estimates[pair] = [replace(white, combination=pair, log_evidence=white.log_evidence + 300)]
+    found = damped.again(damped.stepper)
+    assert pair[:1] in found.estimates and pair[1:] in found.estimates
+    damped.found.estimates.clear()
+    damped.found.estimates.update(before)
+
+
+@pytest.mark.slow
 def test_what_may_do_as_well_is_weighed(damped):
     """Of quadratic drag and dry friction, which were never weighed, one is at least, once rivals were looked for."""
     rivals = [(member(damped, name),) for name in ("quadratic_drag", "coulomb_friction")]

@@ -116,6 +116,9 @@ class Search:
         """Fit and weigh the best combinations anew with another stepper of the same recordings."""
         w, before = self.weigher, self.found
         kept = before.near(_REACH, _AGAIN)
+        best = max(before.estimates, key=before.odds)
+        # What each of its members is worth is told against the rest of them, however far behind that is.
+        kept += [c for k in range(len(best)) if (c := best[:k] + best[k + 1 :]) in before.estimates]
         w.moved_to(stepper, Found(stepper.problem, before.priors, complete=before.complete))
         mine = [c for c in dict.fromkeys([self.base, *kept]) if self._is_mine(c)]
         w.weigh([Start(c, white.z, 0.0) for c in mine if (white := before.of(c, "white"))], whole=True)
