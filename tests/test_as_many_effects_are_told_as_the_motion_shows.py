@@ -53,6 +53,18 @@ def test_a_fourth_effect_is_not_looked_for_where_two_are_all():
     assert "a fourth effect" not in said
 
 
+def test_of_more_than_three_none_has_a_place_and_all_have_names():
+    """Five plain effects may act at once, six may not; with a frequency, a time or a threshold three may."""
+    p = made(1)
+    by_name = {p.candidate(m).effect.name: m for m in p.searched if p.candidate(m).key[1][0] in ("q1", "a")}
+    plain = [by_name[name] for name in ("viscous_damping", "coulomb_friction", "cubic_stiffness", "sensor_bias",
+                                        "sensor_drift", "constant_force")]  # fmt: skip
+    assert p.is_possible(plain[:5]) and not p.is_possible(plain)
+    for name in ("periodic_forcing", "impulse", "contact_stop", "hidden_oscillator"):
+        assert p.is_possible([*plain[:2], by_name[name]])
+        assert not p.is_possible([*plain[:3], by_name[name]])
+
+
 def test_where_all_have_an_unseen_oscillator_the_best_without_a_place_is_carried_on():
     """Of pairs of which the four likeliest have an unseen oscillator, the likeliest without a frequency is extended,
     too, though it lies farther behind than others may; none where it lies much farther, or where one of the four has

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from symplearn.diagnosis._found import Found
+from symplearn.diagnosis._larger import Larger
 from symplearn.diagnosis._search import Search
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._weighed import Estimate
@@ -41,7 +42,10 @@ def test_the_best_under_white_noise_is_extended():
     """Of six pairs the four likeliest, and the last one, which explains most without an error of the sensor."""
     asked = []
     search, pairs = searched([*((2, 0.0, 106.0 - k) for k in range(5)), (2, 50.0, 100.0)])
-    search.prospects = SimpleNamespace(about=lambda combination, number: asked.append(combination) or [])
-    search.refinement = SimpleNamespace(weigh_exchanged=lambda *_: None)
-    assert search._proposals(3) == []
+    larger = Larger.__new__(Larger)
+    larger.refinement = SimpleNamespace(
+        found=search.found, problem=search.found.problem, weigher=search.weigher, weigh_exchanged=lambda *_: None,
+        prospects=SimpleNamespace(about=lambda combination, number: asked.append(combination) or []),
+    )  # fmt: skip
+    assert larger.starts(3) == []
     assert asked == [*pairs[:4], pairs[5]]

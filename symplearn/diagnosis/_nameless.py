@@ -115,7 +115,7 @@ def _weigh_memories(search: Search, members: Sequence[int]) -> None:
     """Combinations of what was found and a force that fades, from where scores put them, or alone."""
     search.progress("weighing forces that remember")
     found, promises = search.found, dict[Combination, tuple[float, Start]]()
-    bases = [c for c in _leaders(search) if len(c) < search.weigher.most]
+    bases = [c for c in _leaders(search) if len(c) < USUAL]
     for c in bases:
         white = found.of(c, "white")
         assert white is not None  # leaders are weighed under white noise
@@ -139,7 +139,7 @@ def _weigh_beside_laws(search: Search, members: Sequence[int]) -> None:
     """A second effect beside the best answer, if that has a law."""
     found = search.found
     best = max(found.estimates, key=found.odds)
-    if set(best) & set(members) and len(best) < search.weigher.most and search.in_time():
+    if set(best) & set(members) and len(best) < USUAL and search.in_time():
         further = sorted(search.prospects.about(best, _PLACES), key=lambda s: -s.gain - found.prices.log(s.combination))
         more = [s for s in further if s.gain > _WORTH and s.combination not in found.estimates][:_BESIDE]
         if more:
@@ -197,7 +197,7 @@ def _promising(search: Search, members: Sequence[int]) -> list[Start]:
     for c in _leaders(search):
         white = found.of(c, "white")
         assert white is not None  # every combination is weighed under white noise first
-        for size in range(1, min(len(c) + 1, search.weigher.most) - len(search.base) + 1):
+        for size in range(1, min(len(c) + 1, USUAL) - len(search.base) + 1):
             for s in search.prospects.with_one_of(c, members, size, _MOST):
                 promise = white.log_evidence + s.gain + found.prices.log(s.combination)
                 if promise > promises.get(s.combination, (-np.inf, s))[0]:

@@ -18,8 +18,9 @@ from .._augmented import Equations
 from .._effects import HIDDEN, NOISE, Candidate, Oscillating
 from .._rows import Rows
 
-MOST = 5  # effects in the largest combination
-USUAL = 3  # and in the largest where these do not leave more to be told
+# Effects in the largest combination, and in the largest that has one at a place or without a word: what a real motion
+# leaves rarely has a name, and a fourth frequency, time or threshold suits itself to that.
+MOST, USUAL = 5, 3
 _FEW = 4  # recordings of which an effect may be in any
 SLOTS = 9  # values of the largest combination: three of three each, or five of fewer
 
@@ -153,13 +154,16 @@ class Problem:
         return out
 
     def is_possible(self, combination: Sequence[int]) -> bool:
-        """Whether a combination can be simulated: each effect and target once, at most one unseen oscillator or force
-        that fades, one force without a name on a coordinate, and no more values than there are slots."""
+        """Whether a combination is looked at: each effect and target once, at most one unseen oscillator or force that
+        fades, one force without a name on a coordinate, no more values than there are slots; of more effects than usual
+        only with names and without a time, frequency or threshold."""
         whole, ones = {self.whole(member) for member in combination}, [self.candidate(m) for m in combination]
         unseen = sum(one.effect.switched for one in ones)
         pushed = [i for one in ones if one.nameless for i in one.places]
         once = len(whole) == len(combination) and len(pushed) == len(set(pushed))
-        return once and len(ones) <= MOST and unseen <= 1 and sum(one.effect.size for one in ones) <= SLOTS
+        plain = all(one.nameless is None and not one.effect.places for one in ones)
+        few = len(ones) <= (MOST if plain else USUAL)
+        return once and few and unseen <= 1 and sum(one.effect.size for one in ones) <= SLOTS
 
     def local(self, recording: int) -> Int[np.ndarray, " local"]:
         """Which entries of z one recording depends on."""

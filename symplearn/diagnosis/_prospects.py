@@ -123,7 +123,8 @@ class Prospects:
         grams = on_trajectory(w.stepper, fits, 0, w.rows)
         sharp = sharp_units(w.stepper, fits, w.rows, w.found.priors)
         wrong = noise_starts(w.problem, fits, w.rows)
-        return wrong + scan(w.problem, grams, z, combination, w.found.priors, self._units(most, sharp), sharp)
+        units = [one for one in self._units(most, sharp) if w.problem.is_possible((*combination, one.candidate))]
+        return wrong + scan(w.problem, grams, z, combination, w.found.priors, units, sharp)
 
     def _fitted(self, combination: Combination) -> Fits | None:
         """A combination as it was fitted; None where it ran away."""
