@@ -71,7 +71,7 @@ class Larger:
         so what these do together is weighed, too, from what follows the readings best."""
         if seen := [c for c in best if not self._has_unseen(c)]:
             self.refinement.weigh_plain(max(seen, key=self.found.white), size, _EACH)
-        return [c for c in best if self._may_follow(c, best[0]) and not any(map(self._has_place, c))][:1]
+        return [c for c in best if self._may_follow(c, best[0]) and self.refinement.problem.is_plain(c)][:1]
 
     def _has_unseen(self, combination: Combination) -> bool:
         return any(self.refinement.problem.candidate(m).effect.switched for m in combination)

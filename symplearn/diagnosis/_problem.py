@@ -161,9 +161,13 @@ class Problem:
         unseen = sum(one.effect.switched for one in ones)
         pushed = [i for one in ones if one.nameless for i in one.places]
         once = len(whole) == len(combination) and len(pushed) == len(set(pushed))
-        plain = all(one.nameless is None and not one.effect.places for one in ones)
-        few = len(ones) <= (MOST if plain else USUAL)
+        few = len(ones) <= (MOST if self.is_plain(combination) else USUAL)
         return once and few and unseen <= 1 and sum(one.effect.size for one in ones) <= SLOTS
+
+    def is_plain(self, combination: Sequence[int]) -> bool:
+        """Whether all effects have names, and none a time, a frequency or a threshold."""
+        ones = [self.candidate(m) for m in combination]
+        return all(one.nameless is None and not one.effect.places for one in ones)
 
     def local(self, recording: int) -> Int[np.ndarray, " local"]:
         """Which entries of z one recording depends on."""

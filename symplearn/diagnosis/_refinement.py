@@ -13,7 +13,7 @@ from ._driven import as_driven
 from ._found import Found, speaker
 from ._gaps import across_gaps
 from ._modes import along_the_modes
-from ._problem import Combination, Problem
+from ._problem import USUAL, Combination, Problem
 from ._prospects import MANY, Prospects
 from ._scan import ends, spacing
 from ._score import Start, inverse
@@ -30,7 +30,8 @@ _PROMISED, _PLACES = 2.0, 2
 _ELSEWHERE = 3.0
 # Steps of what fades, as shares of how fast it does.
 _FADING = 0.25
-# Combinations like the best of a size that are fitted, and how far behind a regression may see them.
+# Combinations like the best of a size that are fitted, twice as many of more effects than usual, and how far behind a
+# regression may see them.
 _ALIKE, _BEHIND = 8, 30.0
 
 
@@ -130,7 +131,7 @@ class Refinement:
             mine = [c for c in self._mine() if len(c) == size + base]
             best = max(mine, key=self.found.odds, default=None)
             if best is not None and self.found.odds(best) > max(map(self.found.odds, self._mine())) - _NEAR:
-                self.weigh_exchanged(best, size, _ALIKE)
+                self.weigh_exchanged(best, size, _ALIKE if size + base <= USUAL else 2 * _ALIKE)
 
     def weigh_exchanged(self, combination: Combination, size: int, number: int) -> None:
         """Combinations of a size that may do as well as the best one, from where a regression about it puts them."""
