@@ -90,7 +90,7 @@ class Search:
                 self._weigh_singles()
             elif starts := self.larger.starts(size):
                 self._weigh_in_batches(starts, self._is_near(size - 1))
-            else:
+            elif not self._is_many(size):  # of these, exchanges may have found some
                 break
             if self.in_time():
                 self.refinement.move_stops(size)
