@@ -56,13 +56,11 @@ class Larger:
         """Starts of one effect more, with the log evidence that they promise; of more effects than usual those that
         promise more than what is new costs."""
         # Thinned frequencies miss an oscillation that stays in tune throughout, so the best one has more of them.
-        mine, white = (
-            self.refinement.prospects.about(combination, MANY if first else _FEW),
-            self.found.white(combination),
-        )
+        mine = self.refinement.prospects.about(combination, MANY if first else _FEW)
         if size + len(self.refinement.weigher.base) > USUAL:
             prior = self.found.prices.log
             mine = [s for s in mine if s.gain > prior(combination) - prior(s.combination)]
+        white = self.found.white(combination)
         return [replace(start, gain=start.gain + white) for start in mine]
 
     def _without_places(self, best: Sequence[Combination], size: int) -> list[Combination]:
