@@ -1,10 +1,8 @@
 """What a rig's true form predicts: fitted by SciPy from the truth on, and run on over the rows that are held out."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 from ._rigs_nature import Rig, Values, motion
@@ -15,7 +13,7 @@ _LOST = 1e6
 
 def held_out(rig: Rig, readings: np.ndarray, fitted: int) -> np.ndarray:
     """Rms errors, by column, of the rows after the first ones that are fitted."""
-    values, parameters, states = _predicted(rig, _fit(rig, readings, fitted), motion_of=_quickly)
+    values, parameters, states = _predicted(rig, _fit(rig, readings, fitted))
     shown = rig.shown(states, rig.times, values, parameters)
     return np.asarray(np.sqrt(np.mean((readings - shown)[fitted:] ** 2, axis=0)))
 
@@ -37,7 +35,7 @@ def _fit(rig: Rig, readings: np.ndarray, fitted: int) -> np.ndarray:
     given = np.array(list(rig.given.values()))
 
     def errors(z: np.ndarray) -> np.ndarray:
-        values, parameters, states = _predicted(first, z, motion_of=_quickly)
+        values, parameters, states = _predicted(first, z)
         missed = (readings[:fitted] - first.shown(states, first.times, values, parameters)) / rig.noise
         off = (np.array(list(parameters.values())) - given[:, 0]) / given[:, 1]
         return np.concatenate([np.clip(np.nan_to_num(missed.ravel(), nan=_LOST), -_LOST, _LOST), off])
@@ -50,20 +48,12 @@ def _free(rig: Rig) -> list[str]:
     return [k for k, value in rig.values.items() if value and (k in rig.effects or "joined" in rig.effects)]
 
 
-def _predicted(
-    rig: Rig, z: np.ndarray, motion_of: Callable[[Rig, Values, Values, np.ndarray], np.ndarray]
-) -> tuple[Values, Values, np.ndarray]:
+def _predicted(rig: Rig, z: np.ndarray) -> tuple[Values, Values, np.ndarray]:
+    """Values, parameters and states of some shares."""
     free = _free(rig)
     values = rig.values | {k: rig.values[k] * (1 + x) for k, x in zip(free, z, strict=False)}
     rest = z[len(free) :]
     parameters = {k: v + rig.given[k][1] * x for (k, v), x in zip(rig.parameters.items(), rest, strict=False)}
     size = np.maximum(np.abs(rig.start), 0.1 * rig.scale)
-    return values, parameters, motion_of(rig, values, parameters, rig.start + size * rest[len(parameters) :])
-
-
-def _quickly(rig: Rig, values: Values, parameters: Values, start: np.ndarray) -> np.ndarray:
-    """Motion by LSODA, to a millionth of what a fit can tell."""
-    found = solve_ivp(rig.rates(values, parameters), (rig.times[0], rig.times[-1]), start, "LSODA", rig.times,
-                      rtol=1e-8, atol=1e-10 * rig.scale, max_step=np.ptp(rig.times) / 200)  # fmt: skip
-    done = found.success and found.y.shape[1] == len(rig.times)
-    return found.y.T if done else np.full((len(rig.times), len(start)), 1e3 * rig.scale)
+    start = rig.start + size * rest[len(parameters) :]
+    return values, parameters, motion(rig, values, parameters, start, rig.times, quickly=True)

@@ -27,7 +27,7 @@ def searched(evidences):
         for kind, value in zip(("white", "coloured"), values, strict=True):
             found.add(Estimate(c, kind, np.zeros(p.size), np.eye(p.size), np.ones(1), value, True))
     search = Search.__new__(Search)
-    search.weigher = SimpleNamespace(found=found, base=())
+    search.weigher = SimpleNamespace(found=found, base=(), is_many=lambda size: False)
     return search, some
 
 

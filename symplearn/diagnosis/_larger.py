@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from ._found import Found
-from ._problem import USUAL, Combination
+from ._problem import Combination, Problem
 from ._prospects import MANY
 from ._refinement import Refinement
 from ._score import Start
@@ -25,6 +25,10 @@ class Larger:
     def found(self) -> Found:
         return self.refinement.found
 
+    @property
+    def problem(self) -> Problem:
+        return self.refinement.problem
+
     def starts(self, size: int) -> list[Start]:
         """Where fits of combinations of one size begin, outliers that are taken out aside; the likeliest first."""
         best = self._best_of(size - 1)
@@ -34,8 +38,13 @@ class Larger:
         # What an error of the sensor hides, an effect less, shows where there is none; and no exchange takes out what
         # is unseen.
         plain = sorted(best, key=self.found.white, reverse=True)[:1]
-        seen = [c for c in best if self._may_follow(c, best[0]) and not self._has_unseen(c)][:1]
-        bare = self._without_places(best, size) if all(any(map(self._has_place, c)) for c in near) else []
+        seen = [c for c in best if self._may_follow(c, best[0]) and not self.problem.has_unseen(c)][:1]
+        bare: list[Combination] = []
+        if all(any(map(self._has_place, c)) for c in near):
+            # A place suits itself to what several others do together, each of which does little alone. No way may lead
+            # there one by one, so what these do together is weighed, too; and the best without any place is extended.
+            self._weigh_plain(best, size)
+            bare = [c for c in best if self._may_follow(c, best[0]) and self.problem.is_plain(c)][:1]
         kept: dict[tuple[Combination, int], Start] = {}
         for k, c in enumerate(dict.fromkeys([*near, *plain, *seen, *bare])):
             # As many of each: what a score promises about a poor fit is too much.
@@ -57,25 +66,19 @@ class Larger:
         promise more than what is new costs."""
         # Thinned frequencies miss an oscillation that stays in tune throughout, so the best one has more of them.
         mine = self.refinement.prospects.about(combination, MANY if first else _FEW)
-        if size + len(self.refinement.weigher.base) > USUAL:
+        if self.refinement.weigher.is_many(size):
             prior = self.found.prices.log
             mine = [s for s in mine if s.gain > prior(combination) - prior(s.combination)]
         white = self.found.white(combination)
         return [replace(start, gain=start.gain + white) for start in mine]
 
-    def _without_places(self, best: Sequence[Combination], size: int) -> list[Combination]:
-        """Where all of the nearest have an effect at a place, the best without any, if it is not far: a place suits
-        itself to what several others do together, each of which does little alone. No way may lead there one by one,
-        so what these do together is weighed, too, from what follows the readings best."""
-        if seen := [c for c in best if not self._has_unseen(c)]:
+    def _weigh_plain(self, best: Sequence[Combination], size: int) -> None:
+        """What effects without a place do together, from what follows the readings best."""
+        if seen := [c for c in best if not self.problem.has_unseen(c)]:
             self.refinement.weigh_plain(max(seen, key=self.found.white), size, _EACH)
-        return [c for c in best if self._may_follow(c, best[0]) and self.refinement.problem.is_plain(c)][:1]
-
-    def _has_unseen(self, combination: Combination) -> bool:
-        return any(self.refinement.problem.candidate(m).effect.switched for m in combination)
 
     def _has_place(self, member: int) -> bool:
-        return bool(self.refinement.problem.candidate(member).effect.places)
+        return bool(self.problem.candidate(member).effect.places)
 
     def _keep(self, listed: Sequence[Start], kept: dict[tuple[Combination, int], Start]) -> None:
         """Add the best of some starts, each combination from two places at most."""

@@ -20,16 +20,20 @@ def over_widest(logs: Float[np.ndarray, "lane weighed"]) -> Float[np.ndarray, " 
 
 
 def over_choices(
-    weighed: Weigh, widths: Float[np.ndarray, "lane effect width"], sizes: Float[np.ndarray, "lane effect"]
-) -> Float[np.ndarray, " lane"]:
+    weighed: Weigh, widths: Float[np.ndarray, "lane effect width"], centre: Float[np.ndarray, "lane a"],
+    own: Int[np.ndarray, " a"],
+) -> Float[np.ndarray, " lane"]:  # fmt: skip
     """The same of every effect's `widths` with every other's. Of more than three effects these are too many: there as
     if each width were likelier or not whatever the others are, about a likely choice.
 
-    That is the one nearest to the effects' `sizes`, or the one that its lines lead to, whichever is likelier.
+    That is the one nearest to the effects' sizes, of which `centre` has the entries and `own` tells whose each is, or
+    the one that its lines lead to, whichever is likelier.
     """
     lanes, effects, number = widths.shape
     if effects <= _TOGETHER:
-        return over_widest(weighed(_choices(number, effects)[None].repeat(lanes, 0)))
+        every = _choices(number, effects)
+        return over_widest(weighed(np.broadcast_to(every, (lanes, *every.shape))))
+    sizes = np.stack([np.sqrt((centre[:, own == k] ** 2).mean(1)) for k in range(effects)], axis=1)
     nearest = np.abs(np.log(widths / np.maximum(sizes, 1e-300)[..., None])).argmin(-1)
     first, before = _lines(weighed, nearest, number)
     second, after = _lines(weighed, before[:, :-1].reshape(lanes, effects, number).argmax(-1), number)

@@ -169,6 +169,10 @@ class Problem:
         ones = [self.candidate(m) for m in combination]
         return all(one.nameless is None and not one.effect.places for one in ones)
 
+    def has_unseen(self, combination: Sequence[int]) -> bool:
+        """Whether an effect brings unknowns of its own: an unseen oscillator, a force that fades."""
+        return any(self.candidate(m).effect.switched for m in combination)
+
     def local(self, recording: int) -> Int[np.ndarray, " local"]:
         """Which entries of z one recording depends on."""
         own = np.arange(recording * self.state, (recording + 1) * self.state)

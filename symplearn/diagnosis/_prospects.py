@@ -94,11 +94,8 @@ class Prospects:
         whiten = whitening(problem, fits, w.rows, beside) if beside else None
         regression = Regression(w.stepper, fits, w.rows, w.found.priors, some, whiten)
         known = [c for c in w.found.estimates if beside is None or w.found.of(c, beside.kind)]
-        among = self._is_plain if plainly else None
+        among = (lambda m: problem.is_plain((m,))) if plainly else None
         return regression.subsets(size + len(w.base), set(known).__contains__, number, among)
-
-    def _is_plain(self, member: int) -> bool:
-        return not self.weigher.problem.candidate(member).effect.places
 
     def _without_a_place(self, combination: Combination) -> list[int]:
         """Effects without a place, in all recordings or in the same as one of a combination's members."""
@@ -121,9 +118,11 @@ class Prospects:
     def _scanned(self, fits: Fits, most: int) -> list[Start]:
         w, (combination,), (z,) = self.weigher, fits.combinations, fits.z
         grams = on_trajectory(w.stepper, fits, 0, w.rows)
-        sharp = sharp_units(w.stepper, fits, w.rows, w.found.priors)
+        able = {m for m in w.problem.searched if w.problem.is_possible((*combination, m))}
+        placed = any(w.problem.candidate(m).effect.places for m in able)
+        sharp = sharp_units(w.stepper, fits, w.rows, w.found.priors) if placed else {}
         wrong = noise_starts(w.problem, fits, w.rows)
-        units = [one for one in self._units(most, sharp) if w.problem.is_possible((*combination, one.candidate))]
+        units = [one for one in self._units(most, sharp) if one.candidate in able]
         return wrong + scan(w.problem, grams, z, combination, w.found.priors, units, sharp)
 
     def _fitted(self, combination: Combination) -> Fits | None:

@@ -13,7 +13,7 @@ from ._driven import as_driven
 from ._found import Found, speaker
 from ._gaps import across_gaps
 from ._modes import along_the_modes
-from ._problem import USUAL, Combination, Problem
+from ._problem import Combination, Problem
 from ._prospects import MANY, Prospects
 from ._scan import ends, spacing
 from ._score import Start, inverse
@@ -131,7 +131,7 @@ class Refinement:
             mine = [c for c in self._mine() if len(c) == size + base]
             best = max(mine, key=self.found.odds, default=None)
             if best is not None and self.found.odds(best) > max(map(self.found.odds, self._mine())) - _NEAR:
-                self.weigh_exchanged(best, size, _ALIKE if size + base <= USUAL else 2 * _ALIKE)
+                self.weigh_exchanged(best, size, 2 * _ALIKE if self.weigher.is_many(size) else _ALIKE)
 
     def weigh_exchanged(self, combination: Combination, size: int, number: int) -> None:
         """Combinations of a size that may do as well as the best one, from where a regression about it puts them."""
@@ -169,7 +169,7 @@ class Refinement:
         found = []
         for size in range(1, self.weigher.most + 1):
             mine = [c for c in ranked if len(c) == size and c != self.weigher.base]
-            seen = [c for c in mine if not any(self.problem.candidate(m).effect.switched for m in c)]
+            seen = [c for c in mine if not self.problem.has_unseen(c)]
             found += [*mine[:1], *seen[:1]]
         return list(dict.fromkeys(found))
 

@@ -82,7 +82,7 @@ class Search:
         for size in range(1, MOST - len(self.base) + 1):
             if size > 1 and not self.in_time():
                 break
-            if self._is_many(size) and not self._is_worth_more(size - 1):
+            if self.weigher.is_many(size) and not self._is_worth_more(size - 1):
                 break
             self.weigher.most = max(USUAL, size + len(self.base))
             self.progress(f"looking where {_ONE_MORE[size]} would help")
@@ -90,13 +90,13 @@ class Search:
                 self._weigh_singles()
             elif starts := self.larger.starts(size):
                 self._weigh_in_batches(starts, self._is_near(size - 1))
-            elif not self._is_many(size):  # of these, exchanges may have found some
+            elif not self.weigher.is_many(size):  # of these, exchanges may have found some
                 break
             if self.in_time():
                 self.refinement.move_stops(size)
                 self.refinement.move_modes(size)
                 self.refinement.cross_gaps(size)
-            if size > 1 and not self._is_many(size) and not self._gained(size):
+            if size > 1 and not self.weigher.is_many(size) and not self._gained(size):
                 break
         self._refine()
         self._weigh_remainders()
@@ -281,14 +281,10 @@ class Search:
             for value, least in ((self.found.best, _WORTH), (self.found.white, _REACH))
         )
 
-    def _is_many(self, size: int) -> bool:
-        """Whether these are more effects than usual."""
-        return size + len(self.base) > USUAL
-
     def _is_worth_more(self, size: int) -> bool:
         """Whether the likeliest has so many effects, and the last of them is worth more than it costs; of more than
         usual, whether that is so among the ones that may have so many."""
-        some = [c for c in self.found.estimates if not self._is_many(size) or self.problem.is_plain(c)]
+        some = [c for c in self.found.estimates if not self.weigher.is_many(size) or self.problem.is_plain(c)]
         mine = [self.found.odds(c) for c in some if self._size(c) == size]
         less = [self.found.odds(c) for c in some if self._size(c) < size]
         return max(mine, default=-np.inf) > max(less, default=-np.inf) + _WORTH

@@ -170,9 +170,7 @@ def mixture_gains(
         every = np.concatenate([widths, np.ones((len(centre), 1, a))], axis=1)
         return _log_weights(told, likelihood, every, lowest, own, alone)
 
-    squares = np.where(sound[:, None], centre, 0.0) ** 2
-    sizes = np.sqrt(np.stack([squares[:, own == k].mean(1) for k in range(effects)], axis=1))
-    return _sound(over_choices(weighed, shares, sizes), sound)
+    return _sound(over_choices(weighed, shares, centre, own), sound)
 
 
 def _sound(gains: Float[np.ndarray, " lane"], sound: Bool[np.ndarray, " lane"]) -> Float[np.ndarray, " lane"]:

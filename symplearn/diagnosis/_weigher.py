@@ -60,6 +60,10 @@ class Weigher:
     def problem(self) -> Problem:
         return self.stepper.problem
 
+    def is_many(self, size: int) -> bool:
+        """Whether so many effects, outliers that are taken out aside, are more than usual."""
+        return size + len(self.base) > USUAL
+
     def moved_to(self, stepper: Stepper, found: Found) -> None:
         """Go on with another stepper of the same recordings."""
         self.plain = self.stepper = stepper
