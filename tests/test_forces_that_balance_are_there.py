@@ -35,10 +35,18 @@ def test_a_motor_against_its_brake():
     assert forces('[forces]\np = "-0.5*p"', p, "p**2/2 + q**2") == pytest.approx(np.sqrt(max(apart, together)))
 
 
-def test_where_no_force_is_known_one_that_would_stop_it_counts():
-    """What glides has no force to compare with: momentum over the time that is recorded, in whatever unit."""
+def test_where_no_force_is_known_one_that_would_turn_it_round_counts():
+    """What glides, or is held by next to nothing, has no force to compare with: twice the largest momentum over the
+    time that is recorded, in whatever unit; a swing's own force is stronger from half a turn on."""
     for size in (1.0, 1e-6):
-        assert forces("", np.full(400, 2.0 * size)) == pytest.approx(2.0 * size / 40.0)
+        slowing = np.linspace(2.0 * size, 0.5 * size, 400)
+        assert forces("", slowing) == pytest.approx(2 * 2.0 * size / 40.0)
+        assert forces("", slowing, "p**2/2 + 1e-9*q**2/2") == pytest.approx(2 * 2.0 * size / 40.0)
+    assert forces("", np.zeros(400)) == 1.0
+    swing = np.sqrt(2.0) * np.cos(np.pi / 40.0 * TIMES)
+    q = np.cumsum(swing) * (TIMES[1] - TIMES[0])
+    stiffness = (np.pi / 40.0) ** 2
+    assert forces("", swing, f"p**2/2 + {stiffness}*q**2/2") == pytest.approx(stiffness * np.sqrt(np.mean(q**2)))
 
 
 @pytest.mark.slow

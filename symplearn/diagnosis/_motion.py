@@ -92,25 +92,27 @@ def motion_along(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarr
     turning = 0.5 * (push - along_all(problem, force, z, back))[:, :d] * v[:, :d]
     p, span = np.concatenate(paths)[:, problem.equations.momentum], max(np.ptp(r.times) for r in problem.rows)
     own = [each[:, np.equal(problem.equations.pushed, i)] for i in range(d)]
+    momenta = np.nanmax(np.abs(p), axis=0)
     return Motion(
         q=np.concatenate([path[:, :d] for path in paths]),
         v=v[:, :d],
-        forces=np.array([_there(push[:, i], own[i], rms(p[:, i]) / span) for i in range(d)]),
+        forces=np.array([_there(push[:, i], own[i], 2 * momenta[i] / span) for i in range(d)]),
         levels=np.array([rms(column) for column in shown.T]),
         times=tuple(r.times[: len(path)] for r, path in zip(problem.rows, paths, strict=True)),
         stiffening=stiffening(problem, z, paths),
         turning=turning,
-        momenta=np.nanmax(np.abs(p), axis=0),
+        momenta=momenta,
         highest=2 * np.pi * max(highest_frequency(r.times[: r.fitted], r.readings[: r.fitted]) for r in problem.rows),
     )
 
 
-def _there(push: Float[np.ndarray, " row"], parts: Float[np.ndarray, "row part"], stop: float) -> float:
+def _there(push: Float[np.ndarray, " row"], parts: Float[np.ndarray, "row part"], turn: float) -> float:
     """How strong the forces on a coordinate are: that of the energy and the known others, which may hold each other, as
-    where a motor turns against its brake. Where there is none, what would stop the motion while it is recorded."""
+    where a motor turns against its brake. At least what would turn the fastest motion round while it is recorded: what
+    glides, or is hardly held, has no force to compare with, and what is missing may be all that bends its path."""
     apart = sum(_mean_square(one) for one in (push - parts.sum(1), *parts.T))
-    square = max(_mean_square(push), apart)
-    return float(np.sqrt(square)) if square > 0 else stop
+    size = max(float(np.sqrt(max(_mean_square(push), apart))), turn)
+    return size if size > 0 else 1.0
 
 
 def stiffening(
