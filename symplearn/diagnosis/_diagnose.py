@@ -15,6 +15,7 @@ from ._answer import Answer
 from ._find import searched
 from ._forecast import forecast_times
 from ._options import Options
+from ._other_units import in_other_units
 from ._record import Diagnosis
 from ._turns import unwrapped
 from ._usable import check_readings
@@ -63,8 +64,9 @@ def _diagnosed(file: SimulationFile, recordings: Sequence[Recording], options: O
     times = _times_ahead(file, recordings[0], options)
     recordings, notes = unwrapped(file, recordings)
     found, stepper, left_out = searched(file, recordings, options, begin + options.time_limit)
+    converted = in_other_units(file, recordings, stepper, found, options)
     options.progress("comparing before and after on the held-out rows")
-    answer = Answer(file, recordings, stepper, found, options, times, [*notes, *left_out])
+    answer = Answer(file, recordings, stepper, found, options, times, [*converted, *notes, *left_out])
     return answer.diagnosis(time.monotonic() - begin)
 
 

@@ -1,0 +1,177 @@
+"""Readings or times in another unit than the simulation's, turned round, or in each other's column.
+
+What seems missing is then as strong as all that is there, and whatever follows the recording has many names. Once they
+are converted the simulation as it is follows them, which is told beside the answer.
+"""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from .._effects import OUTLIERS
+from .._recording import Recording
+from .._simulation_records import SimulationFile
+from ._along import along_all, force
+from ._build import augmented_equations, build, first_substep, rows_fitted
+from ._calibrate import grow, residuals, weights
+from ._found import Found
+from ._options import Options
+from ._problem import Problem
+from ._start import first_fits, priors_without_effects, windows
+from ._trajectory import Stepper
+
+# What readings and times may have been multiplied by, and how that comes about.
+_READ = ((180 / np.pi, "degrees for radians"), (1e3, "thousandths for units"), (1e2, "hundredths for units"),
+         (1e-3, "thousands for units"))  # fmt: skip
+_TIMED = ((1e3, "milliseconds for seconds"), (1e-3, "seconds for milliseconds"), (60.0, "seconds for minutes"),
+          (1 / 60.0, "minutes for seconds"))  # fmt: skip
+# A missing force counts as strong from this share of all that is there, by the best path that follows the recording.
+_STRONG = 0.7
+# The largest share of what the readings vary by that a converted recording may be missed by, and that share's of what
+# it is missed by as it is.
+_FOLLOWED, _BETTER = 0.3, 0.3
+# How many conversions are tried at most.
+_MOST = 20
+# A share of what it is missed by from which on nothing else is tried.
+_CLEARLY = 0.1
+# Conversions do about as well that miss the readings by no more than so many times as much as the best.
+_AS_WELL = 1.5
+# Windows in which trajectories are fitted, by share of the rows, and how many are.
+_GROWTH, _STARTS = (0.16, 0.32, 0.64, 1.0), 4
+
+
+@dataclass(frozen=True)
+class _Conversion:
+    """What is done to the recordings, in words, and the recordings then."""
+
+    said: str
+    recordings: Sequence[Recording]
+
+
+def in_other_units(
+    file: SimulationFile, recordings: Sequence[Recording], stepper: Stepper, found: Found, options: Options
+) -> list[str]:
+    """A sentence where the simulation as it is follows the recordings far better once a column or the time is
+    converted; none where no missing force is as strong as what is there, and where time has run out."""
+    if not found.complete:
+        return []
+    bare = found.of((), "white")
+    missed = np.inf if bare is None else _share(stepper, bare.z[None])
+    if missed < _FOLLOWED or not is_as_strong(stepper.problem, found):
+        return []
+    options.progress("trying whether something is in another unit")
+    tried: list[tuple[float, _Conversion]] = []
+    for one in itertools.islice(_conversions(file, recordings), _MOST):
+        tried.append((_missed(file, one.recordings, options), one))
+        if tried[-1][0] < _CLEARLY * min(1.0, missed):
+            break
+    least = min(share for share, _ in tried)
+    if not least < min(_FOLLOWED, _BETTER * missed):
+        return []
+    # Of those that do about as well, as all scales do for what is linear, the one that comes about most easily.
+    share, one = next((share, one) for share, one in tried if share <= _AS_WELL * least)
+    return [
+        f"with {one.said} the simulation misses the readings by {_percent(share)} of what they vary by, with nothing "
+        f"added to it, and by {_percent(missed)} as they are: check units, signs and columns before anything else"
+    ]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %" if share < 1 else "more than all"
+
+
+def _conversions(file: SimulationFile, recordings: Sequence[Recording]) -> Iterator[_Conversion]:
+    """Everything that is tried, what comes about most easily first."""
+    columns, time = recordings[0].columns, file.recording.time
+    every = tuple(range(len(columns)))
+    yield from _rescaled(recordings, every)
+    for j, name in enumerate(columns):
+        yield _Conversion(f"the sign of {name} turned round", [_scaled(r, (j,), -1.0) for r in recordings])
+    for factor, said in _TIMED:
+        yield _Conversion(f"{time} divided by {factor:.4g} ({said})", [_timed(r, factor) for r in recordings])
+    for j, k in itertools.combinations(every, 2):
+        yield _Conversion(f"{columns[j]} and {columns[k]} exchanged", [_exchanged(r, j, k) for r in recordings])
+    for j in every if len(every) > 1 else ():
+        yield from _rescaled(recordings, (j,))
+
+
+def _rescaled(recordings: Sequence[Recording], group: Sequence[int]) -> Iterator[_Conversion]:
+    names = " and ".join(recordings[0].columns[j] for j in group)
+    for factor, said in _READ:
+        what = f"{names} divided by {factor:.4g} ({said})"
+        yield _Conversion(what, [_scaled(r, group, factor) for r in recordings])
+
+
+def _scaled(recording: Recording, group: Sequence[int], factor: float) -> Recording:
+    readings = recording.readings.copy()
+    readings[:, group] /= factor
+    return replace(recording, readings=readings)
+
+
+def _exchanged(recording: Recording, j: int, k: int) -> Recording:
+    readings = recording.readings.copy()
+    readings[:, [j, k]] = readings[:, [k, j]]
+    return replace(recording, readings=readings)
+
+
+def _timed(recording: Recording, factor: float) -> Recording:
+    inputs = recording.inputs
+    if inputs is not None:
+        inputs = replace(inputs, times=inputs.times / factor, missing=inputs.missing / factor)
+    return replace(recording, times=recording.times / factor, inputs=inputs)
+
+
+def is_as_strong(problem: Problem, found: Found) -> bool:
+    """Whether a missing force is as strong as what is there on some coordinate, or none follows the recording."""
+    bare = [c for c in found.estimates if all(problem.candidate(m).effect is OUTLIERS for m in c)]
+    paths = [path for c in bare if (path := found.of(c, "force"))]
+    path = max(paths, key=lambda one: one.log_evidence, default=None)
+    if path is None or path.paths is None or not all(np.isfinite(one).all() for one in path.paths):
+        return True
+    if (path.noise**2 > _FOLLOWED**2 * _variation(problem)).any():
+        return True
+    assert found.priors.forces is not None  # effects were weighed
+    there, span = along_all(problem, force, path.z, path.paths), problem.equations.momentum
+    rate = np.concatenate([np.gradient(one[:, span], r.times[: len(one)], axis=0)
+                           for one, r in zip(path.paths, problem.rows, strict=True)])  # fmt: skip
+    missing = np.sqrt(((rate - there)[:, : problem.equations.declared] ** 2).mean(0))
+    return bool((missing > _STRONG * found.priors.forces[: len(missing)]).any())
+
+
+def _missed(file: SimulationFile, recordings: Sequence[Recording], options: Options) -> float:
+    """What share of their variation converted recordings are missed by along the simulation's best trajectory."""
+    first, middle = float(recordings[0].times[0]), float(np.mean(recordings[0].times[[0, -1]]))
+    built = augmented_equations(file, first, options.restriction, middle)
+    # A step that the file gives is as long as the recordings ask that it was written for.
+    free = replace(file, integrator=replace(file.integrator, step=None))
+    substep = first_substep(free, recordings)
+    stepper = Stepper(build(file, built, recordings, options.holdout, substep, options.restriction), options.jobs)
+    priors, rows = priors_without_effects(stepper.problem), rows_fitted(stepper.problem.rows)
+    z = first_fits(stepper, priors, rows).z[:_STARTS]
+    growing = windows(rows, _GROWTH, max(8, 4 * stepper.problem.state))
+    return _share(stepper, grow(stepper, z, [()] * len(z), priors, growing).z)
+
+
+@np.errstate(all="ignore")  # a trajectory that ran away misses everything
+def _share(stepper: Stepper, z: Float[np.ndarray, "lane z"]) -> float:
+    """What share of their variation, in the mean over columns, the readings are missed by along the best trajectory."""
+    problem, rows = stepper.problem, rows_fitted(stepper.problem.rows)
+    weight = weights(problem, rows)
+    errors = residuals(problem, stepper.predict(z, [()] * len(z), rows), weight)
+    number = sum((w > 0).sum(0) for w in weight)
+    square = sum((x**2).sum(1) for x in errors) / np.maximum(number, 1)
+    vary = _variation(problem)
+    some = np.isfinite(vary)
+    share = np.sqrt((square[:, some] / vary[some]).sum(1) / max(some.sum(), 1))
+    return float(np.min(np.where(np.isnan(share), np.inf, share)))
+
+
+def _variation(problem: Problem) -> Float[np.ndarray, " channel"]:
+    """Variance of every column's fitted readings, NaN where they do not vary."""
+    read = np.concatenate([r.readings[: r.fitted] for r in problem.rows])
+    seen = [column[~np.isnan(column)] for column in read.T]
+    vary = np.array([column.var() if len(column) else 0.0 for column in seen])
+    return np.where(vary > 0, vary, np.nan)

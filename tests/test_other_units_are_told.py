@@ -1,0 +1,75 @@
+"""Where a column or the time is in another unit, turned round, or in another's place, a warning says what to check."""
+
+import engine_cases as cases
+import numpy as np
+import pytest
+
+from symplearn.diagnosis import Options, diagnose
+from symplearn.diagnosis._build import Restriction
+
+TIMES = np.linspace(0.0, 8.0, 160)
+# What the files say is wrong whatever is searched, and one effect is the quickest search.
+ONE = Restriction(("viscous_damping",))
+
+
+def swing(start=0.8, damping=0.05, times=TIMES):
+    """A pendulum's angle with a little damping, of w^2 = 20, read to 0.008 rad."""
+    motion = cases.solved(lambda t, x: [x[1], -20 * np.sin(x[0]) - damping * x[1]], [start, 0.0], times)
+    return motion[:, 0] + 0.008 * np.random.default_rng(5).normal(size=len(times))
+
+
+def thrown():
+    """A ball thrown without air, read to 0.01 m."""
+    t = np.linspace(0.0, 1.2, 80)
+    exact = np.stack([3.0 * t, 1.0 + 5.0 * t - 4.905 * t**2], axis=1)
+    return t, exact + 0.01 * np.random.default_rng(6).normal(size=exact.shape)
+
+
+def asked(file, times, readings, columns=None):
+    """The warnings of a diagnosis, and what was said on the way."""
+    said = []
+    options = Options(restriction=ONE, progress=said.append, jobs=2)
+    found = diagnose(file, [cases.recorded(times, readings, columns=columns)], options)
+    return found.document["warnings"], said
+
+
+PENDULUM = cases.simulation("p**2/2 - 20*cos(q)")
+BALL = cases.simulation("(px**2 + py**2)/2 + 9.81*y", ("x", "y"), ("px", "py"), {"a": "x", "b": "y"})
+
+
+def test_degrees_for_radians_are_told():
+    """A pendulum read in degrees, whose simulation has radians, is told to be that, first of all warnings."""
+    warnings, _ = asked(PENDULUM, TIMES, np.degrees(swing()))
+    assert warnings[0].startswith("with y0 divided by 57.3 (degrees for radians) the simulation misses")
+
+
+@pytest.mark.slow
+def test_milliseconds_for_seconds_are_told():
+    """So are times in milliseconds."""
+    warnings, _ = asked(PENDULUM, 1000 * TIMES, swing())
+    assert warnings[0].startswith("with t_s divided by 1000 (milliseconds for seconds)")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("said, change", [
+    ("with the sign of b turned round", lambda r: r * [1.0, -1.0]),
+    ("with a and b exchanged", lambda r: r[:, ::-1]),
+    ("with a and b divided by 1000 (thousandths for units)", lambda r: 1000 * r),
+])  # fmt: skip
+def test_signs_columns_and_millimetres_are_told(said, change):
+    """Heights that count downwards, columns in each other's place, and a ball read in millimetres."""
+    times, readings = thrown()
+    warnings, _ = asked(BALL, times, change(readings), columns=("a", "b"))
+    assert warnings[0].startswith(said)
+
+
+@pytest.mark.slow
+def test_no_unit_is_tried_where_nothing_as_strong_as_all_that_is_there_is_missing():
+    """A strong damping, a spring half as stiff again, or nothing at all, are no matter of units; nor is a force as
+    strong as those there that no other unit explains."""
+    for readings in (swing(damping=1.0), swing(damping=0.0)):
+        warnings, said = asked(PENDULUM, TIMES, readings)
+        assert not any("another unit" in one for one in said) and not any("check units" in one for one in warnings)
+    bent = cases.solved(lambda t, x: [x[1], -20 * np.sin(x[0]) - 60 * x[0] ** 3], [0.8, 0.0], TIMES)[:, 0]
+    warnings, said = asked(PENDULUM, TIMES, bent + 0.008 * np.random.default_rng(7).normal(size=len(TIMES)))
+    assert not any("check units" in one for one in warnings)
