@@ -8,8 +8,8 @@ from symplearn.diagnosis import Options, diagnose
 from symplearn.diagnosis._build import Restriction
 
 TIMES = np.linspace(0.0, 8.0, 160)
-# What the files say is wrong whatever is searched, and one effect is the quickest search.
-ONE = Restriction(("viscous_damping",))
+# What the files say is wrong whatever is searched; two effects are a quick search, one of them with a body of its own.
+TWO = Restriction(("viscous_damping", "hidden_oscillator"))
 
 
 def swing(start=0.8, damping=0.05, times=TIMES):
@@ -28,7 +28,7 @@ def thrown():
 def asked(file, times, readings, columns=None):
     """The warnings of a diagnosis, and what was said on the way."""
     said = []
-    options = Options(restriction=ONE, progress=said.append, jobs=2)
+    options = Options(restriction=TWO, progress=said.append, jobs=2)
     found = diagnose(file, [cases.recorded(times, readings, columns=columns)], options)
     return found.document["warnings"], said
 

@@ -72,7 +72,7 @@ class Threads:
         self._begun = True
         yield from map(work, items[:first])
         rest = items[first:]
-        yield from self._pool.map(work, rest) if self.jobs > 1 and len(rest) > 1 else map(work, rest)
+        yield from self._pool.map(_as_here(work), rest) if self.jobs > 1 and len(rest) > 1 else map(work, rest)
 
     def ahead(self, work: Callable[[A], B], items: Sequence[A]) -> Iterator[B]:
         """The work on every item in order, on threads of its own while what comes before is being used."""
@@ -80,4 +80,15 @@ class Threads:
             yield from map(work, items)
             return
         with ThreadPoolExecutor(self.jobs) as pool:
-            yield from pool.map(work, items)
+            yield from pool.map(_as_here(work), items)
+
+
+def _as_here(work: Callable[[A], B]) -> Callable[[A], B]:
+    """Work that minds floating-point errors on a thread of its own as it would here, which NumPy does not see to."""
+    minded = np.geterr()
+
+    def done(item: A) -> B:
+        with np.errstate(**minded):
+            return work(item)
+
+    return done

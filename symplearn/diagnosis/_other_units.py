@@ -134,11 +134,12 @@ def is_as_strong(problem: Problem, found: Found) -> bool:
     if (path.noise**2 > _FOLLOWED**2 * _variation(problem)).any():
         return True
     assert found.priors.forces is not None  # effects were weighed
-    there, span = along_all(problem, force, path.z, path.paths), problem.equations.momentum
-    rate = np.concatenate([np.gradient(one[:, span], r.times[: len(one)], axis=0)
+    own, d = problem.equations.momentum, problem.equations.declared  # what is unseen may come after it
+    rate = np.concatenate([np.gradient(one[:, own][:, :d], r.times[: len(one)], axis=0)
                            for one, r in zip(path.paths, problem.rows, strict=True)])  # fmt: skip
-    missing = np.sqrt(((rate - there)[:, : problem.equations.declared] ** 2).mean(0))
-    return bool((missing > _STRONG * found.priors.forces[: len(missing)]).any())
+    there = along_all(problem, force, path.z, path.paths)[:, :d]
+    missing = np.sqrt(((rate - there) ** 2).mean(0))
+    return bool((missing > _STRONG * found.priors.forces[:d]).any())
 
 
 def _missed(file: SimulationFile, recordings: Sequence[Recording], options: Options) -> float:
