@@ -1,9 +1,13 @@
 """Where a column or the time is in another unit, turned round, or in another's place, a warning says what to check."""
 
+import itertools
+from functools import partial
+
 import engine_cases as cases
 import numpy as np
 import pytest
 
+from symplearn._inputs import Inputs
 from symplearn.diagnosis import Options, diagnose
 from symplearn.diagnosis._build import Restriction
 
@@ -61,6 +65,30 @@ def test_signs_columns_and_millimetres_are_told(said, change):
     times, readings = thrown()
     warnings, _ = asked(BALL, times, change(readings), columns=("a", "b"))
     assert warnings[0].startswith(said)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tilt, said", [
+    (0.0, "with the sign of y0, or of what drives it, turned round the simulation misses"),
+    (4.0, "with the sign of the input u turned round the simulation misses"),
+])  # fmt: skip
+def test_an_input_that_pushes_the_other_way_is_told(tilt, said):
+    """A pendulum is pushed hard to one side and to the other, and its file has every push the other way; of one that
+    hangs straight that is as if it were read the other way."""
+    push = 12.0 * np.sign(np.sin(1.3 * TIMES + 0.4))
+    x, motion = np.array([0.3, 0.0]), []
+    for (a, b), u in zip(itertools.pairwise(TIMES), push, strict=False):
+        motion.append(x[0])
+        x = cases.solved(partial(pushed, u + tilt), x, np.array([a, b]))[-1]
+    read = np.append(motion, x[0]) + 0.008 * np.random.default_rng(8).normal(size=len(TIMES))
+    file = cases.simulation(f"p**2/2 - 20*cos(q) - (u + {tilt})*q", recording='inputs = ["u"]')
+    recording = cases.recorded(TIMES, read, Inputs(TIMES, -push[:, None], "hold"))
+    warnings = diagnose(file, [recording], Options(restriction=TWO, jobs=2)).document["warnings"]
+    assert warnings[0].startswith(said)
+
+
+def pushed(torque, _, x):
+    return [x[1], -20 * np.sin(x[0]) + torque]
 
 
 @pytest.mark.slow

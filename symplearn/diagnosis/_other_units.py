@@ -1,4 +1,4 @@
-"""Readings or times in another unit than the simulation's, turned round, or in each other's column.
+"""Readings or times in another unit than the simulation's, turned round, as an input may be, or in each other's column.
 
 What seems missing is then as strong as all that is there, and whatever follows the recording has many names. Once they
 are converted the simulation as it is follows them, which is told beside the answer.
@@ -88,8 +88,11 @@ def _conversions(file: SimulationFile, recordings: Sequence[Recording]) -> Itera
     columns, time = recordings[0].columns, file.recording.time
     every = tuple(range(len(columns)))
     yield from _rescaled(recordings, every)
+    driven = ", or of what drives it," if file.recording.inputs else ""  # of what is symmetric these are one
     for j, name in enumerate(columns):
-        yield _Conversion(f"the sign of {name} turned round", [_scaled(r, (j,), -1.0) for r in recordings])
+        yield _Conversion(f"the sign of {name}{driven} turned round", [_scaled(r, (j,), -1.0) for r in recordings])
+    for j, name in enumerate(file.recording.inputs):
+        yield _Conversion(f"the sign of the input {name} turned round", [_driven_back(r, j) for r in recordings])
     for factor, said in _TIMED:
         yield _Conversion(f"{time} divided by {factor:.4g} ({said})", [_timed(r, factor) for r in recordings])
     for j, k in itertools.combinations(every, 2):
@@ -115,6 +118,13 @@ def _exchanged(recording: Recording, j: int, k: int) -> Recording:
     readings = recording.readings.copy()
     readings[:, [j, k]] = readings[:, [k, j]]
     return replace(recording, readings=readings)
+
+
+def _driven_back(recording: Recording, j: int) -> Recording:
+    assert recording.inputs is not None  # it has a column of them
+    values = recording.inputs.values.copy()
+    values[:, j] *= -1.0
+    return replace(recording, inputs=replace(recording.inputs, values=values))
 
 
 def _timed(recording: Recording, factor: float) -> Recording:
