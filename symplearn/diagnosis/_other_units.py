@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._effects import OUTLIERS
+from .._errors import InputError
 from .._recording import Recording
 from .._simulation_records import SimulationFile
 from ._along import along_all, force
@@ -33,8 +34,8 @@ _STRONG = 0.7
 # The largest share of what the readings vary by that a converted recording may be missed by, and that share's of what
 # it is missed by as it is.
 _FOLLOWED, _BETTER = 0.3, 0.3
-# How many conversions are tried at most.
-_MOST = 20
+# How many conversions are tried at most, and by how many rows of every recording.
+_MOST, _ROWS = 20, 200
 # A share of what it is missed by from which on nothing else is tried.
 _CLEARLY = 0.1
 # Conversions do about as well that miss the readings by no more than so many times as much as the best.
@@ -59,10 +60,11 @@ def in_other_units(
     if not found.complete:
         return []
     bare = found.of((), "white")
-    missed = np.inf if bare is None else _share(stepper, bare.z[None])
+    missed = np.inf if bare is None else _share(stepper, bare.z[None], _first(stepper.problem))
     if missed < _FOLLOWED or not is_as_strong(stepper.problem, found):
         return []
     options.progress("trying whether something is in another unit")
+    missed = min(missed, _missed(file, recordings, options))
     tried: list[tuple[float, _Conversion]] = []
     for one in itertools.islice(_conversions(file, recordings), _MOST):
         tried.append((_missed(file, one.recordings, options), one))
@@ -153,23 +155,37 @@ def is_as_strong(problem: Problem, found: Found) -> bool:
 
 
 def _missed(file: SimulationFile, recordings: Sequence[Recording], options: Options) -> float:
-    """What share of their variation converted recordings are missed by along the simulation's best trajectory."""
-    first, middle = float(recordings[0].times[0]), float(np.mean(recordings[0].times[[0, -1]]))
-    built = augmented_equations(file, first, options.restriction, middle)
-    # A step that the file gives is as long as the recordings ask that it was written for.
-    free = replace(file, integrator=replace(file.integrator, step=None))
-    substep = first_substep(free, recordings)
-    stepper = Stepper(build(file, built, recordings, options.holdout, substep, options.restriction), options.jobs)
-    priors, rows = priors_without_effects(stepper.problem), rows_fitted(stepper.problem.rows)
+    """What share of their variation converted recordings are missed by along the simulation's best trajectory;
+    infinite where they cannot be laid out."""
+    try:
+        stepper = Stepper(_converted(file, recordings, options), options.jobs)
+    except InputError:
+        return np.inf
+    priors, rows = priors_without_effects(stepper.problem), _first(stepper.problem)
     z = first_fits(stepper, priors, rows).z[:_STARTS]
     growing = windows(rows, _GROWTH, max(8, 4 * stepper.problem.state))
-    return _share(stepper, grow(stepper, z, [()] * len(z), priors, growing).z)
+    return _share(stepper, grow(stepper, z, [()] * len(z), priors, growing).z, rows)
+
+
+def _converted(file: SimulationFile, recordings: Sequence[Recording], options: Options) -> Problem:
+    """The problem of converted recordings, in steps as long as they ask: one that the file gives is for what it was
+    written for."""
+    first, middle = float(recordings[0].times[0]), float(np.mean(recordings[0].times[[0, -1]]))
+    built = augmented_equations(file, first, options.restriction, middle)
+    substep = first_substep(replace(file, integrator=replace(file.integrator, step=None)), recordings)
+    return build(file, built, recordings, options.holdout, substep, options.restriction)
+
+
+def _first(problem: Problem) -> list[int]:
+    """The rows that conversions are judged by: what is missing besides, as a damping, soon hides all else."""
+    return [min(n, _ROWS) for n in rows_fitted(problem.rows)]
 
 
 @np.errstate(all="ignore")  # a trajectory that ran away misses everything
-def _share(stepper: Stepper, z: Float[np.ndarray, "lane z"]) -> float:
-    """What share of their variation, in the mean over columns, the readings are missed by along the best trajectory."""
-    problem, rows = stepper.problem, rows_fitted(stepper.problem.rows)
+def _share(stepper: Stepper, z: Float[np.ndarray, "lane z"], rows: Sequence[int]) -> float:
+    """What share of their variation, in the mean over columns, the first rows of every recording are missed by along
+    the best trajectory."""
+    problem = stepper.problem
     weight = weights(problem, rows)
     errors = residuals(problem, stepper.predict(z, [()] * len(z), rows), weight)
     number = sum((w > 0).sum(0) for w in weight)
