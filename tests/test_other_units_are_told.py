@@ -93,8 +93,8 @@ def pushed(torque, _, x):
 
 @pytest.mark.slow
 def test_no_unit_is_tried_where_nothing_as_strong_as_all_that_is_there_is_missing():
-    """A strong damping, a spring half as stiff again, or nothing at all, are no matter of units; nor is a force as
-    strong as those there that no other unit explains."""
+    """Where a strong damping, or nothing, is missing nothing is converted; where a force as strong as those there is,
+    which no other unit explains, no warning speaks of units."""
     for readings in (swing(damping=1.0), swing(damping=0.0)):
         warnings, said = asked(PENDULUM, TIMES, readings)
         assert not any("another unit" in one for one in said) and not any("check units" in one for one in warnings)

@@ -92,7 +92,7 @@ def motion_along(problem: Problem, z: np.ndarray, paths: Sequence[Float[np.ndarr
     turning = 0.5 * (push - along_all(problem, force, z, back))[:, :d] * v[:, :d]
     p, span = np.concatenate(paths)[:, problem.equations.momentum], max(np.ptp(r.times) for r in problem.rows)
     own = [each[:, np.equal(problem.equations.pushed, i)] for i in range(d)]
-    momenta = np.nanmax(np.abs(p), axis=0)
+    momenta = np.max(np.abs(p), axis=0, where=np.isfinite(p), initial=0.0)
     return Motion(
         q=np.concatenate([path[:, :d] for path in paths]),
         v=v[:, :d],
