@@ -16,10 +16,10 @@ TIMES = np.linspace(0.0, 8.0, 160)
 TWO = Restriction(("viscous_damping", "hidden_oscillator"))
 
 
-def swing(start=0.8, damping=0.05, times=TIMES):
+def swing(damping=0.05):
     """A pendulum's angle with a little damping, of w^2 = 20, read to 0.008 rad."""
-    motion = cases.solved(lambda t, x: [x[1], -20 * np.sin(x[0]) - damping * x[1]], [start, 0.0], times)
-    return motion[:, 0] + 0.008 * np.random.default_rng(5).normal(size=len(times))
+    motion = cases.solved(lambda t, x: [x[1], -20 * np.sin(x[0]) - damping * x[1]], [0.8, 0.0], TIMES)
+    return motion[:, 0] + 0.008 * np.random.default_rng(5).normal(size=len(TIMES))
 
 
 def thrown():

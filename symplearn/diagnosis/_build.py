@@ -93,6 +93,14 @@ def augmented_equations(
     return built
 
 
+def equations_for(
+    file: SimulationFile, recordings: Sequence[Recording], restriction: Restriction, nameless: Sequence[Nameless] = ()
+) -> Equations:
+    """The augmented simulation of some recordings: from the first row of the first one, with phases from its middle."""
+    times = recordings[0].times
+    return augmented_equations(file, float(times[0]), restriction, float(np.mean(times[[0, -1]])), nameless)
+
+
 def first_substep(file: SimulationFile, recordings: Sequence[Recording]) -> float:
     """The longest substep to begin with: the file's own, or a fraction of the readings' shortest period."""
     if file.integrator.step is not None:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from .._effects import UNNAMED, Nameless
 from .._recording import Recording
 from .._simulation_records import SimulationFile
-from ._build import augmented_equations, build
+from ._build import build, equations_for
 from ._effect_priors import STRENGTH, with_nameless
 from ._memories import Span, fading, stiffness
 from ._options import Options
@@ -38,10 +38,8 @@ class Extended:
 
     def extend(self, forces: Sequence[Nameless]) -> None:
         """Let the search go on with these, of which the first ones may be known to it."""
-        search, times = self.search, self.recordings[0].times
-        first, middle = float(times[0]), float(np.mean(times[[0, -1]]))
-        restriction = self.options.restriction
-        built = augmented_equations(self.file, first, restriction, middle, forces)
+        search, restriction = self.search, self.options.restriction
+        built = equations_for(self.file, self.recordings, restriction, forces)
         problem = build(self.file, built, self.recordings, self.options.holdout, self.longest, restriction)
         priors = with_nameless(problem, search.found.priors, self._scales(forces), [self._span(one) for one in forces])
         search.goes_on(Stepper(problem, self.options.jobs), priors)

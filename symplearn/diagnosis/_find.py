@@ -9,7 +9,7 @@ from .._augmented import Equations
 from .._recording import Recording
 from .._simulation_records import SimulationFile
 from ._ahead import look_ahead
-from ._build import augmented_equations, build, first_substep, refined, rows_fitted
+from ._build import build, equations_for, first_substep, refined, rows_fitted
 from ._found import Found, doubtful_outliers, speaker
 from ._lasting import total_noise
 from ._late import left_out, without_the_time_before
@@ -62,8 +62,7 @@ def _begun(
 ) -> tuple[Search, Callable[..., Problem], tuple[float, bool]]:
     """The search for names, what lays its problem out anew, and its longest substep with whether that is fine."""
     check_steps(file, recordings)
-    first, middle = float(recordings[0].times[0]), float(np.mean(recordings[0].times[[0, -1]]))
-    built = augmented_equations(file, first, options.restriction, middle)
+    built = equations_for(file, recordings, options.restriction)
     substep = first_substep(file, recordings)
 
     def rebuild(longest: float, equations: Equations = built) -> Problem:
