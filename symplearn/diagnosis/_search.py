@@ -201,6 +201,8 @@ class Search:
         if first:
             self.progress(f"weighing {len({s.combination for s in first})} likely effects")
             self.weigher.weigh([self._from_nothing(s.combination) if s.combination in plain else s for s in first])
+        if self._adequate() is not None:  # it may stand for what acts unread, which is not seen from its side
+            self._weigh_from_elsewhere()
         if (best := self._adequate()) is not None:
             self.refinement.weigh_exchanged(best, 1, _SMALL)
             return
