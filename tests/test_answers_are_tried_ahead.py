@@ -126,6 +126,43 @@ def test_a_column_that_begins_late_has_no_part_in_what_holds(unit):
     assert ahead[0, 1] == pytest.approx(inside[0, 0] * unit**2, rel=0.1)
 
 
+def test_the_likeliest_without_a_swing_is_tried_however_far_behind(clear):
+    """Beside a forcing that is a thousand nats likelier than anything else, the drag is looked at, too."""
+    found, (*_, drag) = clear
+    p, coloured = found.problem, found.of(drag, "coloured")
+    forcing = next((m,) for m in p.searched if p.candidate(m).effect.name == "periodic_forcing")
+    ahead = [replace(found.of(drag, kind), combination=forcing, log_evidence=coloured.log_evidence + more)
+             for kind, more in (("white", 900.0), ("coloured", 1000.0))]  # fmt: skip
+    other = Found(p, found.priors, {**found.estimates, forcing: ahead})
+    look_ahead(Stepper(p), other, ROWS)
+    assert set(other.ahead) == {(), drag, forcing}
+
+
+@pytest.mark.parametrize(
+    ("swing", "score", "holds", "counts"),
+    [("periodic_forcing", -3.0, True, False), ("hidden_oscillator", -3.0, True, False),
+     ("constant_force", -3.0, True, True),
+     ("periodic_forcing", 0.0, True, True), ("periodic_forcing", -3.0, False, True)],
+    ids=["a force", "an oscillator", "nothing swings", "it predicts better", "the other goes astray, too"],
+)  # fmt: skip
+def test_a_swing_that_goes_astray_is_none_where_something_steady_goes_on(swing, score, holds, counts):
+    """A forcing or an unseen oscillator, 30 nats ahead beside a remainder, that does not go on as it began, is not the
+    answer where a damping goes on that predicts as well."""
+    p, one = swinging(swing, 1.3)
+    damping = next((m,) for m in p.searched if p.candidate(m).effect.name == "viscous_damping")
+    kept = weighed(p)
+    for combination, gain in (((), -2000.0), (damping, 0.0), (one.combination, 30.0)):
+        for kind, more in (("white", 0.0), ("clock", 100.0)):
+            kept.add(replace(one, combination=combination, log_evidence=gain + more, kind=kind))
+    kept.ahead = {
+        (): Ahead(-10.0, False, False),
+        damping: Ahead(-1.0, holds, True),
+        one.combination: Ahead(score, False, True),
+    }
+    told = posterior(p, kept, 1.0).named[0].combination
+    assert told == (one.combination if counts else damping)
+
+
 def test_white_noise_needs_no_second_look():
     """Where the best answer leaves nothing but noise, evidence alone counts, and the best estimate is shown."""
     found, (*_, drag) = found_in(0.0)

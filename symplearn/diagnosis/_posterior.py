@@ -90,6 +90,8 @@ def posterior(problem: Problem, found: Found, inflation: float) -> Posterior:
             evidences[combination] = max(plain, noisy - np.log(remainder))
             continue
         total = evidences[combination] = float(np.logaddexp(plain + np.log(1.0 - _BESIDE), noisy))
+        if _swings_out_of_step(problem, found, combination):
+            continue
         if _informed(problem, found, combination) and not _is_remainder(problem, found, combination):
             # What no fit of came to its end, as where a time stops between two rows, may have less than it was given.
             doubt = 0.0 if any(e.converged for e in estimates) else UNCONVERGED
@@ -128,6 +130,16 @@ def _predicts(problem: Problem, found: Found, combination: Combination, is_dwarf
     if one.holds:
         return one.is_better or not (is_dwarfed and bare is not None and bare.holds)
     return one.is_better and not in_tune(problem, speaker(found.estimates[combination]))
+
+
+def _swings_out_of_step(problem: Problem, found: Found, combination: Combination) -> bool:
+    """Whether something that swings by itself does not go on as it began, where what has nothing of the kind does and
+    predicts as well: beside a clear remainder a swing follows any curve for a while."""
+    one = found.ahead.get(combination)
+    if (one is not None and one.holds) or not problem.swings(combination):
+        return False
+    steady = [other for c, other in found.ahead.items() if problem.is_steady(c)]
+    return any(r.holds and r.is_better and (one is None or r.score >= one.score) for r in steady)
 
 
 @np.errstate(invalid="ignore")  # where neither has an evidence, nothing is dwarfed

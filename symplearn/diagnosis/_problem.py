@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 import integrators as ig
 
 from .._augmented import Equations
-from .._effects import HIDDEN, NOISE, Candidate, Oscillating
+from .._effects import HIDDEN, NOISE, OUTLIERS, Candidate, Oscillating
 from .._rows import Rows
 
 # Effects in the largest combination, and in the largest that has one at a place or without a word: what a real motion
@@ -168,6 +168,16 @@ class Problem:
         """Whether all effects have names, and none a time, a frequency or a threshold."""
         ones = [self.candidate(m) for m in combination]
         return all(one.nameless is None and not one.effect.places for one in ones)
+
+    def swings(self, combination: Sequence[int]) -> bool:
+        """Whether an effect swings by itself: what has a frequency, or an unseen oscillator."""
+        effects = {self.candidate(m).effect for m in combination}
+        return any(effect is HIDDEN or isinstance(effect, Oscillating) for effect in effects)
+
+    def is_steady(self, combination: Sequence[int]) -> bool:
+        """Whether there is an effect, beside what is wrong with single readings, and none swings by itself."""
+        effects = {self.candidate(m).effect for m in combination}
+        return bool(effects - {NOISE, OUTLIERS}) and not self.swings(combination)
 
     def has_unseen(self, combination: Sequence[int]) -> bool:
         """Whether an effect brings unknowns of its own: an unseen oscillator, a force that fades."""
