@@ -17,8 +17,10 @@ from symplearn.diagnosis._effect_priors import with_effects
 from symplearn.diagnosis._forecast import _ahead
 from symplearn.diagnosis._late import left_out
 from symplearn.diagnosis._motion import motion_along
+from symplearn.diagnosis._search import Search
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._stochastic import free_run
+from symplearn.diagnosis._trajectory import Stepper
 
 GAP, K, C = 0.2, 4.0, 0.1
 TIMES = GAP * np.arange(41)
@@ -166,6 +168,29 @@ def test_what_is_told_of_it_is_what_the_answer_says():
         (told,) = left_out(problem, found(problem, *estimates), [given], [used])
         assert told.startswith(f"the sensor of b {how}: its first readings, 2 in all")
     assert left_out(problem, found(problem, late), [given], [given]) == []
+
+
+def test_the_search_without_that_takes_up_what_was_found_before():
+    """What an earlier search thought likely is fitted again, from where it was, to the readings that are used now; what
+    was far behind it, and what another choice of outliers had, is not."""
+    times = np.linspace(0.0, 12.0, 60)
+    drag = cases.solved(lambda t, x: [x[1], -x[0] - 0.1 * np.abs(x[1]) * x[1]], [1.0, 0.0], times)[:, 0]
+    problem = cases.problem(cases.simulation("p**2/2 + q**2/2"), [cases.recorded(times, drag)], 0.05)
+    alone = {problem.candidate(m).effect.name: (m,) for m in problem.searched}
+    begun = [estimate(problem, alone[name], gain) for name, gain in (
+        ("quadratic_drag", 50.0), ("cubic_stiffness", -50.0), ("sensor_outliers", 50.0))]  # fmt: skip
+    begun[0].z[[0, problem.slots]] = 0.9, 0.08
+    earlier = found(problem, estimate(problem, (), 0.0), *begun)
+    seeds = np.zeros((1, problem.size))
+    search = Search(Stepper(problem), seeds, np.inf, lambda message: None, earlier=earlier)
+    search.found.priors = replace(
+        search.found.priors, scales=np.ones(problem.equations.size), precision=np.full(problem.size, 1e-2)
+    )
+    search._take_up()
+    assert set(search.found.estimates) == {alone["quadratic_drag"]}
+    white = search.found.of(alone["quadratic_drag"], "white")
+    # The error of the steps, which the search takes as they are. Seen: 1.2e-6 and 1.2e-7.
+    assert white.z[[0, problem.slots]] == pytest.approx([1.0, 0.1], abs=1e-5)
 
 
 def test_a_forecast_knows_the_same_of_its_inputs():

@@ -44,7 +44,7 @@ def searched(
             break
         options.progress("searching once more without what late sensors show of the time before")
         recordings = shown
-        search, rebuild, steps = _begun(file, recordings, options, deadline)
+        search, rebuild, steps = _begun(file, recordings, options, deadline, search.found)
     weigh_nameless(file, recordings, options, search, steps[0])
     likeliest = max(search.found.estimates, key=search.found.odds)
     if search.found.has_law(likeliest):  # its shape may pass faster than the motion
@@ -58,8 +58,9 @@ def searched(
 
 
 def _begun(
-    file: SimulationFile, recordings: Sequence[Recording], options: Options, deadline: float
-) -> tuple[Search, Callable[..., Problem], tuple[float, bool]]:
+    file: SimulationFile, recordings: Sequence[Recording], options: Options, deadline: float,
+    earlier: Found | None = None,
+) -> tuple[Search, Callable[..., Problem], tuple[float, bool]]:  # fmt: skip
     """The search for names, what lays its problem out anew, and its longest substep with whether that is fine."""
     check_steps(file, recordings)
     built = equations_for(file, recordings, options.restriction)
@@ -80,7 +81,7 @@ def _begun(
     noise = np.maximum(seeds.noise[0], _ROUGH * rough_noise(problem, rows_fitted(problem.rows)))
     finer, substep, is_fine = refined(rebuild, problem, seeds.z[0], noise, substep)
     stepper = stepper if finer is problem else Stepper(finer, options.jobs)
-    search = _run(stepper, seeds.z, deadline, options)
+    search = _run(stepper, seeds.z, deadline, options, earlier)
     return search, rebuild, _refined(search, rebuild, (substep, is_fine), options)
 
 
@@ -100,7 +101,7 @@ def _refined(
     return longest, is_fine
 
 
-def _run(stepper: Stepper, seeds: np.ndarray, deadline: float, options: Options) -> Search:
+def _run(stepper: Stepper, seeds: np.ndarray, deadline: float, options: Options, earlier: Found | None) -> Search:
     """Search with outliers taken out; anew with those of a column left in that turn out to be none: what the simulation
     misses of a motion may look like outliers of a path that follows it, and takes their places in a combination. Beside
     a clear remainder they may be a part of it: there the likelier one of both searches is the answer. What the other
@@ -109,7 +110,7 @@ def _run(stepper: Stepper, seeds: np.ndarray, deadline: float, options: Options)
     rival: Search | None = None
     before: Found | None = None
     while True:
-        search = Search(stepper, seeds, deadline, options.progress, spared)
+        search = Search(stepper, seeds, deadline, options.progress, spared, earlier)
         found = search.run()
         if rival is not None and _most(rival.found) >= _most(found):
             rival.found.stand_by(found)

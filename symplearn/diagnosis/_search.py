@@ -49,11 +49,12 @@ class Search:
 
     def __init__(
         self, stepper: Stepper, seeds: np.ndarray, deadline: float, progress: Callable[[str], None],
-        spared: frozenset[int] = frozenset(),
+        spared: frozenset[int] = frozenset(), earlier: Found | None = None,
     ):  # fmt: skip
+        """`earlier` is what a search of the same recordings found, of which more was used."""
         self.weigher = Weigher(stepper, Found(stepper.problem, priors_without_effects(stepper.problem)))
         self.rows = self.weigher.rows
-        self.deadline, self.progress = deadline, progress
+        self.deadline, self.progress, self.earlier = deadline, progress, earlier
         self.beginning = Beginning(self.weigher, seeds, progress, spared)
         self.prospects = Prospects(self.weigher)
         self.refinement = Refinement(self.prospects, progress)
@@ -98,6 +99,7 @@ class Search:
                 self.refinement.cross_gaps(size)
             if size > 1 and not self.weigher.is_many(size) and not self._gained(size):
                 break
+        self._take_up()
         self._refine()
         self._weigh_remainders()
         if self.in_time():
@@ -162,6 +164,15 @@ class Search:
         self.prospects, self.remainders = Prospects(w), Remainders(w, self.progress)
         self.refinement = Refinement(self.prospects, self.progress)
         self.larger = Larger(self.refinement)
+
+    def _take_up(self) -> None:
+        """Weigh the likeliest of an earlier search, too, from where they were found."""
+        if self.earlier is None or not self.in_time():
+            return
+        kept = [c for c in self.earlier.near(_REACH, _AGAIN) if self._is_mine(c)]
+        self.weigher.most = max([self.weigher.most, *map(len, kept)])
+        found = [(c, white) for c in kept if (white := self.earlier.of(c, "white"))]
+        self.weigher.weigh([Start(c, white.z, 0.0) for c, white in found], whole=True)
 
     def _refine(self) -> None:
         """The best once more from elsewhere, with what may do as well, and with what is left without a member."""
