@@ -42,9 +42,8 @@ def look_ahead(stepper: Stepper, found: Found, rows: Sequence[int]) -> None:
     near = [c for c in ranked if found.best(c) > top - _REACH and found.of(c, "white")]
     # Nothing, and the likeliest that does not swing by itself, have to be among them.
     steady = [c for c in ranked if stepper.problem.is_steady(c) and found.of(c, "white")]
-    held = [*(c for c in found.estimates if c == ()), *steady[:1]]
-    near = [c for c in near if c not in held]
-    tried = [*near[: _MOST - len(held)], *held]
+    others = [c for c in ((), *steady[:1]) if found.of(c, "white")]
+    tried = [*[c for c in near if c not in others][: _MOST - len(others)], *others]
     less = dict.fromkeys(_before_it(stepper.problem, c) for c in tried)
     found.ahead = _scores(stepper, found, [*tried, *(c for c in less if c not in tried and found.of(c, "white"))], rows)
 
