@@ -96,7 +96,7 @@ def test_outliers_beside_a_clear_remainder_are_tried_without(monkeypatch, ahead_
     class Searching(Search):
         """Finds these outliers beside an error of the clock, or, where they are left in, something else."""
 
-        def __init__(self, stepper, seeds, deadline, progress, spared):
+        def __init__(self, stepper, seeds, deadline, progress, spared, earlier=None):
             found = Found(p, priors_without_effects(p))
             base = () if spared else (outliers,)
             self.weigher = SimpleNamespace(stepper=stepper, problem=p, found=found, base=base)

@@ -101,7 +101,9 @@ def _refined(
     return longest, is_fine
 
 
-def _run(stepper: Stepper, seeds: np.ndarray, deadline: float, options: Options, earlier: Found | None) -> Search:
+def _run(
+    stepper: Stepper, seeds: np.ndarray, deadline: float, options: Options, earlier: Found | None = None
+) -> Search:
     """Search with outliers taken out; anew with those of a column left in that turn out to be none: what the simulation
     misses of a motion may look like outliers of a path that follows it, and takes their places in a combination. Beside
     a clear remainder they may be a part of it: there the likelier one of both searches is the answer. What the other
