@@ -37,7 +37,7 @@ _SMALL, _ALIKE = 24, 4
 _FORCED = 6
 # Combinations that are fitted between two looks at the clock.
 _BATCH = 32
-# Combinations that are weighed again in finer steps.
+# Combinations that are weighed again, in finer steps or by fewer readings.
 _AGAIN = 24
 # Places at which an effect is tried along a path.
 _FEW = 60
@@ -122,8 +122,7 @@ class Search:
         # What each of its members is worth is told against the rest of them, however far behind that is.
         kept += [c for k in range(len(best)) if (c := best[:k] + best[k + 1 :]) in before.estimates]
         w.moved_to(stepper, Found(stepper.problem, before.priors, complete=before.complete))
-        mine = [c for c in dict.fromkeys([self.base, *kept]) if self._is_mine(c)]
-        w.weigh([Start(c, white.z, 0.0) for c in mine if (white := before.of(c, "white"))], whole=True)
+        w.weigh(self._where(before, [self.base, *kept]), whole=True)
         white = before.of(self.base, "white")
         if white is not None and self.found.white(self.base) < white.log_evidence - _REACH:
             # What goes round once more between two readings looks alike in coarse steps.
@@ -169,10 +168,14 @@ class Search:
         """Weigh the likeliest of an earlier search, too, from where they were found."""
         if self.earlier is None or not self.in_time():
             return
-        kept = [c for c in self.earlier.near(_REACH, _AGAIN) if self._is_mine(c)]
-        self.weigher.most = max([self.weigher.most, *map(len, kept)])
-        found = [(c, white) for c in kept if (white := self.earlier.of(c, "white"))]
-        self.weigher.weigh([Start(c, white.z, 0.0) for c, white in found], whole=True)
+        starts = self._where(self.earlier, self.earlier.near(_REACH, _AGAIN))
+        self.weigher.most = max([self.weigher.most, *(len(start.combination) for start in starts)])
+        self.weigher.weigh(starts, whole=True)
+
+    def _where(self, before: Found, combinations: Sequence[Combination]) -> list[Start]:
+        """Where combinations were found before, as far as they have the outliers of this search."""
+        mine = [c for c in dict.fromkeys(combinations) if self._is_mine(c)]
+        return [Start(c, white.z, 0.0) for c in mine if (white := before.of(c, "white"))]
 
     def _refine(self) -> None:
         """The best once more from elsewhere, with what may do as well, and with what is left without a member."""
