@@ -56,3 +56,7 @@ class Progress:
             self._status.update(f"{passed:4.0f} s  {message}")
         elif passed > 1.0:
             self._console.print(f"{passed:6.1f} s  {message}", markup=False, highlight=False)
+
+    def notice(self, message: str) -> None:
+        """Tell what stays to be read."""
+        self._console.print(f"Notice: {message}", markup=False, highlight=False, soft_wrap=True)

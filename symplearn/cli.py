@@ -103,6 +103,7 @@ def diagnose(
                 forecast_until=forecast_until,
                 forecast_step=forecast_step,
                 progress=progress.say,
+                notice=progress.notice,
             ),
         )
         progress.say("writing the report")

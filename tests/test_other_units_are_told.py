@@ -1,6 +1,7 @@
 """Where a column or the time is in another unit, turned round, or in another's place, a warning says what to check."""
 
 import itertools
+import re
 from functools import partial
 
 import engine_cases as cases
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from symplearn._inputs import Inputs
+from symplearn._progress import Progress
 from symplearn.diagnosis import Options, diagnose
 from symplearn.diagnosis._build import Restriction
 
@@ -37,6 +39,7 @@ def asked(file, times, readings, columns=None):
     return found.document["warnings"], said
 
 
+OPEN = cases.simulation("p**2/2 - w*cos(q)", more="[parameters]\nw = { value = 19.8, sd = 0.3 }")
 PENDULUM = cases.simulation("p**2/2 - 20*cos(q)")
 BALL = cases.simulation("(px**2 + py**2)/2 + 9.81*y", ("x", "y"), ("px", "py"), {"a": "x", "b": "y"})
 
@@ -47,11 +50,42 @@ def test_degrees_for_radians_are_told():
     assert warnings[0].startswith("with y0 divided by 57.3 (degrees for radians) the simulation misses")
 
 
+MILLISECONDS = "with t_s divided by 1000 (milliseconds for seconds)"
+
+
 @pytest.mark.slow
 def test_milliseconds_for_seconds_are_told():
     """So are times in milliseconds."""
     warnings, _ = asked(PENDULUM, 1000 * TIMES, swing())
-    assert warnings[0].startswith("with t_s divided by 1000 (milliseconds for seconds)")
+    assert warnings[0].startswith(MILLISECONDS)
+
+
+class Stopped(Exception):
+    """A person stops the work, having read something."""
+
+
+def test_milliseconds_are_noticed_before_the_search():
+    """Before the search, which takes many times as long as with seconds, a notice tells of milliseconds; none tells of
+    seconds."""
+
+    def stop(message):
+        raise Stopped(message)
+
+    def begins(message):
+        if "following the recording" in message:
+            raise Stopped("the search begins")
+
+    options = Options(restriction=TWO, progress=begins, notice=stop, jobs=2)
+    for unit, said in ((1000, MILLISECONDS), (1, "the search begins")):
+        with pytest.raises(Stopped, match=re.escape(said)):
+            diagnose(OPEN, [cases.recorded(unit * TIMES, swing())], options)
+
+
+def test_a_notice_stays_on_stderr(capsys):
+    """A notice is a line of its own on stderr, from the first second on."""
+    with Progress() as progress:
+        progress.notice("stop here")
+    assert capsys.readouterr().err == "Notice: stop here\n"
 
 
 @pytest.mark.slow

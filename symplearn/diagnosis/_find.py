@@ -16,6 +16,7 @@ from ._late import left_out, without_the_time_before
 from ._nameless import is_clear, weigh_nameless
 from ._null_paths import rough_noise
 from ._options import Options
+from ._other_units import notice_another_time
 from ._problem import Problem
 from ._search import Search
 from ._start import first_fits, priors_without_effects
@@ -77,6 +78,8 @@ def _begun(
     stepper = Stepper(problem, options.jobs)
     options.progress("finding where the motion starts")
     seeds = first_fits(stepper, priors_without_effects(problem), rows_fitted(problem.rows))
+    if earlier is None:
+        notice_another_time(file, recordings, stepper, seeds.z, options)
     # A few rows are fitted too well to tell the noise; where it is still too small, the search only takes longer.
     noise = np.maximum(seeds.noise[0], _ROUGH * rough_noise(problem, rows_fitted(problem.rows)))
     finer, substep, is_fine = refined(rebuild, problem, seeds.z[0], noise, substep)

@@ -27,6 +27,7 @@ class Options:
     - `forecast_until`: the time that a forecast runs to; None for no forecast.
     - `forecast_step`: spacing of the forecast's rows, by default the first recording's median one.
     - `progress`: told what is being done.
+    - `notice`: told during the work what a person may want to stop it for.
 
     **Raises:** `InputError` where one of them is none of these.
     """
@@ -39,6 +40,7 @@ class Options:
     forecast_until: float | None = None
     forecast_step: float | None = None
     progress: Callable[[str], None] = lambda message: None
+    notice: Callable[[str], None] = lambda message: None
 
     def __post_init__(self) -> None:
         _need("holdout", self.holdout, _is_number(self.holdout) and 0 <= self.holdout < 1,
@@ -51,6 +53,7 @@ class Options:
         _need("time_limit", self.time_limit, _is_number(self.time_limit) and self.time_limit > 0,
               "give a positive number of seconds")  # fmt: skip
         _need("progress", self.progress, callable(self.progress), "give a function of a message")
+        _need("notice", self.notice, callable(self.notice), "give a function of a message")
         self._check_forecast()
 
     def _check_forecast(self) -> None:

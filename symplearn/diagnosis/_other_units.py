@@ -32,6 +32,8 @@ _TIMED = ((1e3, "milliseconds for seconds"), (1e-3, "seconds for milliseconds"),
 # A missing force counts as strong from this share of all that is there, by the best path that follows the recording.
 # Seen: 0.93 for columns exchanged, 1.8 for a sign and 12 for degrees; 0.09 at most in fifteen concealed cases.
 _STRONG = 0.5
+# Calibrated values count as torn from their priors from so many standard deviations on. Seen: 67 for milliseconds.
+_TORN = 20.0
 # The largest share of what the readings vary by that a converted recording may be missed by, and that share's of what
 # it is missed by as it is. Seen once converted: 0.0004 to 0.07, and 0.21 beside a strong damping.
 _FOLLOWED, _BETTER = 0.3, 0.3
@@ -43,6 +45,8 @@ _CLEARLY = 0.1
 _AS_WELL = 1.5
 # Windows in which trajectories are fitted, by share of the rows, and how many are.
 _GROWTH, _STARTS = (0.16, 0.32, 0.64, 1.0), 4
+# The share of the rows, and how many at least, that the first fits have to follow; otherwise other times are tried.
+_BEGINNING, _FEW = 0.08, 14
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,24 @@ class _Conversion:
 
     said: str
     recordings: Sequence[Recording]
+
+
+def notice_another_time(
+    file: SimulationFile, recordings: Sequence[Recording], stepper: Stepper, z: Float[np.ndarray, "lane z"],
+    options: Options,
+) -> None:  # fmt: skip
+    """Say before the search, which takes many times as long then, that times seem to be in another unit: where the
+    first fits do not even follow a few rows, and the simulation follows many once the times are converted."""
+    few = windows(rows_fitted(stepper.problem.rows), (_BEGINNING,), max(_FEW, 4 * stepper.problem.state))[0]
+    if _share(stepper, z[:_STARTS], few) < _FOLLOWED:
+        return
+    options.progress("trying whether the time is in another unit")
+    missed = _missed(file, recordings, options)
+    for one in _in_other_times(file, recordings):
+        share = _missed(file, one.recordings, options)
+        if share < _CLEARLY * min(1.0, missed):
+            options.notice(f"{_told(one, share, missed)}: stop here and convert them, if that is what they are")
+            return
 
 
 def in_other_units(
@@ -76,10 +98,14 @@ def in_other_units(
         return []
     # Of those that do about as well, as all scales do for what is linear, the one that comes about most easily.
     share, one = next((share, one) for share, one in tried if share <= _AS_WELL * least)
-    return [
+    return [f"{_told(one, share, missed)}: check units, signs and columns before anything else"]
+
+
+def _told(one: _Conversion, share: float, missed: float) -> str:
+    return (
         f"with {one.said} the simulation misses the readings by {_percent(share)} of what they vary by, with nothing "
-        f"added to it, and by {_percent(missed)} as they are: check units, signs and columns before anything else"
-    ]
+        f"added to it, and by {_percent(missed)} as they are"
+    )
 
 
 def _percent(share: float) -> str:
@@ -88,7 +114,7 @@ def _percent(share: float) -> str:
 
 def _conversions(file: SimulationFile, recordings: Sequence[Recording]) -> Iterator[_Conversion]:
     """Everything that is tried, what comes about most easily first."""
-    columns, time = recordings[0].columns, file.recording.time
+    columns = recordings[0].columns
     every = tuple(range(len(columns)))
     yield from _rescaled(recordings, every)
     driven = ", or of what drives it," if file.recording.inputs else ""  # of what is symmetric these are one
@@ -96,12 +122,17 @@ def _conversions(file: SimulationFile, recordings: Sequence[Recording]) -> Itera
         yield _Conversion(f"the sign of {name}{driven} turned round", [_scaled(r, (j,), -1.0) for r in recordings])
     for j, name in enumerate(file.recording.inputs):
         yield _Conversion(f"the sign of the input {name} turned round", [_driven_back(r, j) for r in recordings])
-    for factor, said in _TIMED:
-        yield _Conversion(f"{time} divided by {factor:.4g} ({said})", [_timed(r, factor) for r in recordings])
+    yield from _in_other_times(file, recordings)
     for j, k in itertools.combinations(every, 2):
         yield _Conversion(f"{columns[j]} and {columns[k]} exchanged", [_exchanged(r, j, k) for r in recordings])
     for j in every if len(every) > 1 else ():
         yield from _rescaled(recordings, (j,))
+
+
+def _in_other_times(file: SimulationFile, recordings: Sequence[Recording]) -> Iterator[_Conversion]:
+    for factor, said in _TIMED:
+        what = f"{file.recording.time} divided by {factor:.4g} ({said})"
+        yield _Conversion(what, [_timed(r, factor) for r in recordings])
 
 
 def _rescaled(recordings: Sequence[Recording], group: Sequence[int]) -> Iterator[_Conversion]:
@@ -138,13 +169,16 @@ def _timed(recording: Recording, factor: float) -> Recording:
 
 
 def _is_as_strong(problem: Problem, found: Found) -> bool:
-    """Whether a missing force is as strong as what is there on some coordinate, or none follows the recording."""
+    """Whether a missing force is as strong as what is there on some coordinate, or none follows the recording but with
+    calibrated values torn from their priors, which say how strong what is there is."""
     bare = [c for c in found.estimates if all(problem.candidate(m).effect is OUTLIERS for m in c)]
     paths = [path for c in bare if (path := found.of(c, "force"))]
     path = max(paths, key=lambda one: one.log_evidence, default=None)
     if path is None or path.paths is None or not all(np.isfinite(one).all() for one in path.paths):
         return True
     if (path.noise**2 > _FOLLOWED**2 * _variation(problem)).any():
+        return True
+    if (problem.calibrated.moved(path.z[problem.head : problem.slots]) > _TORN).any():
         return True
     assert found.priors.forces is not None  # effects were weighed
     own, d = problem.equations.momentum, problem.equations.declared  # what is unseen may come after it
