@@ -60,6 +60,19 @@ def test_milliseconds_for_seconds_are_told():
     assert warnings[0].startswith(MILLISECONDS)
 
 
+@pytest.mark.slow
+def test_milliseconds_are_told_where_another_gravity_follows_them():
+    """So are they where the simulation follows them with a calibrated value that its prior rules out."""
+    times = 0.005 * np.arange(600)
+    motion = cases.solved(lambda t, x: [x[1], -21.8 * np.sin(x[0]) - 0.03 * x[1]], [0.8, 0.0], times)[:, 0]
+    readings = motion + 0.004 * np.random.default_rng(3).normal(size=len(times))
+    known = "[parameters]\nw = { value = 21.6, sd = 0.3 }\n[recording.noise]\ny0 = 0.004"
+    file = cases.simulation("p**2/2 - w*cos(q)", observe={"y0": "q"}, more=known)
+    options = Options(restriction=Restriction(("viscous_damping",)), jobs=2)
+    warnings = diagnose(file, [cases.recorded(1000 * times, readings)], options).document["warnings"]
+    assert warnings[0].startswith(MILLISECONDS)
+
+
 class Stopped(Exception):
     """A person stops the work, having read something."""
 

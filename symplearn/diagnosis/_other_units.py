@@ -32,8 +32,8 @@ _TIMED = ((1e3, "milliseconds for seconds"), (1e-3, "seconds for milliseconds"),
 # A missing force counts as strong from this share of all that is there, by the best path that follows the recording.
 # Seen: 0.93 for columns exchanged, 1.8 for a sign and 12 for degrees; 0.09 at most in fifteen concealed cases.
 _STRONG = 0.5
-# Calibrated values count as torn from their priors from so many standard deviations on. Seen: 67 for milliseconds.
-_TORN = 20.0
+# Calibrated values count as torn from their priors from so many standard deviations on. Seen for milliseconds: 20 to 67.
+_TORN = 10.0
 # The largest share of what the readings vary by that a converted recording may be missed by, and that share's of what
 # it is missed by as it is. Seen once converted: 0.0004 to 0.07, and 0.21 beside a strong damping.
 _FOLLOWED, _BETTER = 0.3, 0.3
