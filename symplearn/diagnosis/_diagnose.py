@@ -15,7 +15,6 @@ from ._answer import Answer
 from ._find import searched
 from ._forecast import forecast_times
 from ._options import Options
-from ._other_units import in_other_units
 from ._record import Diagnosis
 from ._turns import unwrapped
 from ._usable import check_readings
@@ -63,10 +62,9 @@ def _diagnosed(file: SimulationFile, recordings: Sequence[Recording], options: O
     check_readings(file, recordings)
     times = _times_ahead(file, recordings[0], options)
     recordings, notes = unwrapped(file, recordings)
-    found, stepper, left_out = searched(file, recordings, options, begin + options.time_limit)
-    converted = in_other_units(file, recordings, stepper, found, options)
+    found, stepper, told = searched(file, recordings, options, begin + options.time_limit)
     options.progress("comparing before and after on the held-out rows")
-    answer = Answer(file, recordings, stepper, found, options, times, [*converted, *notes, *left_out])
+    answer = Answer(file, recordings, stepper, found, options, times, [*told, *notes])
     return answer.diagnosis(time.monotonic() - begin)
 
 

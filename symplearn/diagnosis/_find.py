@@ -2,6 +2,7 @@
 no name fits."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,13 +11,14 @@ from .._recording import Recording
 from .._simulation_records import SimulationFile
 from ._ahead import look_ahead
 from ._build import build, equations_for, first_substep, refined, rows_fitted
+from ._calibrate import Fits
 from ._found import Found, doubtful_outliers, speaker
 from ._lasting import total_noise
 from ._late import left_out, without_the_time_before
 from ._nameless import is_clear, weigh_nameless
 from ._null_paths import rough_noise
 from ._options import Options
-from ._other_units import notice_another_time
+from ._other_units import in_another_time, in_other_units
 from ._problem import Problem
 from ._search import Search
 from ._start import first_fits, priors_without_effects
@@ -29,40 +31,50 @@ _ROUGH = 0.3
 _ANEW = 2
 
 
+@dataclass(frozen=True)
+class _Laid:
+    """A problem in steps to begin with, the first fits, and what lays it out anew in steps of another length."""
+
+    stepper: Stepper
+    seeds: Fits
+    rebuild: Callable[..., Problem]
+    substep: float
+
+
 def searched(
     file: SimulationFile, recordings: Sequence[Recording], options: Options, deadline: float
 ) -> tuple[Found, Stepper, list[str]]:
     """Lay the problem out with substeps that are fine enough, and search; once more where what is found needs finer,
-    or shows readings to be of another time, which is told in sentences.
+    or shows readings to be of another time, which is told in sentences, as other units are.
 
     `InputError` where there is nothing to fit, to search or to step.
     """
     given = recordings
-    search, rebuild, steps = _begun(file, recordings, options, deadline)
+    laid = _laid_out(file, recordings, options)
+    units = in_another_time(file, recordings, laid.stepper, laid.seeds.z, options)
+    search, steps = _begun(laid, options, deadline)
     for _ in range(_ANEW):
         shown = without_the_time_before(search.stepper, search.found, recordings)
         if shown is None or not search.in_time():
             break
         options.progress("searching once more without what late sensors show of the time before")
         recordings = shown
-        search, rebuild, steps = _begun(file, recordings, options, deadline, search.found)
+        laid = _laid_out(file, recordings, options)
+        search, steps = _begun(laid, options, deadline, search.found)
     weigh_nameless(file, recordings, options, search, steps[0])
     likeliest = max(search.found.estimates, key=search.found.odds)
     if search.found.has_law(likeliest):  # its shape may pass faster than the motion
-        steps = _refined(search, lambda longest: rebuild(longest, search.problem.equations), steps, options)
+        steps = _refined(search, lambda longest: laid.rebuild(longest, search.problem.equations), steps, options)
     search.settle()
     found = search.found
     options.progress("comparing how well answers predict ahead")
     look_ahead(search.stepper, found, search.rows)
     found.is_fine = steps[1]
-    return found, search.stepper, left_out(search.problem, found, given, recordings)
+    units = units or in_other_units(file, given, search.stepper, found, options)
+    return found, search.stepper, [*units, *left_out(search.problem, found, given, recordings)]
 
 
-def _begun(
-    file: SimulationFile, recordings: Sequence[Recording], options: Options, deadline: float,
-    earlier: Found | None = None,
-) -> tuple[Search, Callable[..., Problem], tuple[float, bool]]:  # fmt: skip
-    """The search for names, what lays its problem out anew, and its longest substep with whether that is fine."""
+def _laid_out(file: SimulationFile, recordings: Sequence[Recording], options: Options) -> _Laid:
     check_steps(file, recordings)
     built = equations_for(file, recordings, options.restriction)
     substep = first_substep(file, recordings)
@@ -78,14 +90,20 @@ def _begun(
     stepper = Stepper(problem, options.jobs)
     options.progress("finding where the motion starts")
     seeds = first_fits(stepper, priors_without_effects(problem), rows_fitted(problem.rows))
-    if earlier is None:
-        notice_another_time(file, recordings, stepper, seeds.z, options)
+    return _Laid(stepper, seeds, rebuild, substep)
+
+
+def _begun(
+    laid: _Laid, options: Options, deadline: float, earlier: Found | None = None
+) -> tuple[Search, tuple[float, bool]]:
+    """The search for names, and its longest substep with whether that is fine."""
+    problem, seeds = laid.stepper.problem, laid.seeds
     # A few rows are fitted too well to tell the noise; where it is still too small, the search only takes longer.
     noise = np.maximum(seeds.noise[0], _ROUGH * rough_noise(problem, rows_fitted(problem.rows)))
-    finer, substep, is_fine = refined(rebuild, problem, seeds.z[0], noise, substep)
-    stepper = stepper if finer is problem else Stepper(finer, options.jobs)
+    finer, substep, is_fine = refined(laid.rebuild, problem, seeds.z[0], noise, laid.substep)
+    stepper = laid.stepper if finer is problem else Stepper(finer, options.jobs)
     search = _run(stepper, seeds.z, deadline, options, earlier)
-    return search, rebuild, _refined(search, rebuild, (substep, is_fine), options)
+    return search, _refined(search, laid.rebuild, (substep, is_fine), options)
 
 
 def _refined(

@@ -32,8 +32,6 @@ _TIMED = ((1e3, "milliseconds for seconds"), (1e-3, "seconds for milliseconds"),
 # A missing force counts as strong from this share of all that is there, by the best path that follows the recording.
 # Seen: 0.93 for columns exchanged, 1.8 for a sign and 12 for degrees; 0.09 at most in fifteen concealed cases.
 _STRONG = 0.5
-# Calibrated values count as torn from their priors from so many standard deviations on. Seen for milliseconds: 20 to 67.
-_TORN = 10.0
 # The largest share of what the readings vary by that a converted recording may be missed by, and that share's of what
 # it is missed by as it is. Seen once converted: 0.0004 to 0.07, and 0.21 beside a strong damping.
 _FOLLOWED, _BETTER = 0.3, 0.3
@@ -45,6 +43,7 @@ _CLEARLY = 0.1
 _AS_WELL = 1.5
 # Windows in which trajectories are fitted, by share of the rows, and how many are.
 _GROWTH, _STARTS = (0.16, 0.32, 0.64, 1.0), 4
+_CHECK = "check units, signs and columns before anything else"
 # The share of the rows, and how many at least, that the first fits have to follow; otherwise other times are tried.
 _BEGINNING, _FEW = 0.08, 14
 
@@ -57,22 +56,24 @@ class _Conversion:
     recordings: Sequence[Recording]
 
 
-def notice_another_time(
+def in_another_time(
     file: SimulationFile, recordings: Sequence[Recording], stepper: Stepper, z: Float[np.ndarray, "lane z"],
     options: Options,
-) -> None:  # fmt: skip
-    """Say before the search, which takes many times as long then, that times seem to be in another unit: where the
-    first fits do not even follow a few rows, and the simulation follows many once the times are converted."""
+) -> list[str]:  # fmt: skip
+    """A sentence, told at once, where the first fits do not even follow a few rows, and the simulation follows many
+    once the times are converted: the search takes many times as long then, and may find a motion among so many swings
+    between two rows that follows them as well."""
     few = windows(rows_fitted(stepper.problem.rows), (_BEGINNING,), max(_FEW, 4 * stepper.problem.state))[0]
     if _share(stepper, z[:_STARTS], few) < _FOLLOWED:
-        return
+        return []
     options.progress("trying whether the time is in another unit")
     missed = _missed(file, recordings, options)
     for one in _in_other_times(file, recordings):
         share = _missed(file, one.recordings, options)
         if share < _CLEARLY * min(1.0, missed):
             options.notice(f"{_told(one, share, missed)}: stop here and convert them, if that is what they are")
-            return
+            return [f"{_told(one, share, missed)}: {_CHECK}"]
+    return []
 
 
 def in_other_units(
@@ -98,7 +99,7 @@ def in_other_units(
         return []
     # Of those that do about as well, as all scales do for what is linear, the one that comes about most easily.
     share, one = next((share, one) for share, one in tried if share <= _AS_WELL * least)
-    return [f"{_told(one, share, missed)}: check units, signs and columns before anything else"]
+    return [f"{_told(one, share, missed)}: {_CHECK}"]
 
 
 def _told(one: _Conversion, share: float, missed: float) -> str:
@@ -169,16 +170,13 @@ def _timed(recording: Recording, factor: float) -> Recording:
 
 
 def _is_as_strong(problem: Problem, found: Found) -> bool:
-    """Whether a missing force is as strong as what is there on some coordinate, or none follows the recording but with
-    calibrated values torn from their priors, which say how strong what is there is."""
+    """Whether a missing force is as strong as what is there on some coordinate, or none follows the recording."""
     bare = [c for c in found.estimates if all(problem.candidate(m).effect is OUTLIERS for m in c)]
     paths = [path for c in bare if (path := found.of(c, "force"))]
     path = max(paths, key=lambda one: one.log_evidence, default=None)
     if path is None or path.paths is None or not all(np.isfinite(one).all() for one in path.paths):
         return True
     if (path.noise**2 > _FOLLOWED**2 * _variation(problem)).any():
-        return True
-    if (problem.calibrated.moved(path.z[problem.head : problem.slots]) > _TORN).any():
         return True
     assert found.priors.forces is not None  # effects were weighed
     own, d = problem.equations.momentum, problem.equations.declared  # what is unseen may come after it

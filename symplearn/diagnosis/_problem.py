@@ -56,10 +56,6 @@ class Calibrated:
     def size(self) -> int:
         return len(self.names)
 
-    def moved(self, values: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
-        """By how many of its prior standard deviations each value lies from its prior mean; 0 for a flat prior."""
-        return np.abs(values - self.mean) / self.sd
-
 
 @dataclass(frozen=True)
 class InitialPrior:

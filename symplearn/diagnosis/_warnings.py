@@ -88,7 +88,8 @@ def warnings(
     if not found.complete:
         out.append("the time limit was reached before every combination was weighed")
     out += at_bounds(problem, after) + stuck(recordings)
-    for name, moved in zip(c.names, c.moved(after.z[problem.head : problem.slots]), strict=True):
+    for j, name in enumerate(c.names):
+        moved = abs(after.z[problem.head + j] - c.mean[j]) / c.sd[j]
         if moved > 3:
             out.append(f"{name} moved {moved:.1f} of its prior standard deviations to fit the recording")
     if chosen is not None and is_clear(found, chosen.best):
