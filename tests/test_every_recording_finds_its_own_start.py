@@ -64,7 +64,7 @@ def test_what_follows_the_first_readings_best_is_tried_first(swings):
     was drawn."""
     problem, priors = swings.problem, priors_without_effects(swings.problem)
     drawn = scattered(problem, priors)
-    tried = begin._tried(swings, priors, [len(TIMES)] * 2)
+    tried = begin._tried(swings, drawn, [len(TIMES)] * 2)
     half = len(tried) // 2
     np.testing.assert_array_equal(tried[half:], drawn[:half])
     for r, start in enumerate(GOOD):

@@ -17,8 +17,9 @@ from .._recording import Recording
 from .._simulation_records import SimulationFile
 from ._along import along, force
 from ._build import build, equations_for, first_substep, rows_fitted
-from ._calibrate import grow, residuals, weights
+from ._calibrate import grow
 from ._found import Found
+from ._missed import share_missed, variance_read
 from ._options import Options
 from ._problem import Problem
 from ._start import first_fits, priors_without_effects, windows
@@ -176,7 +177,7 @@ def _is_as_strong(problem: Problem, found: Found) -> bool:
     path = max(paths, key=lambda one: one.log_evidence, default=None)
     if path is None or path.paths is None or not all(np.isfinite(one).all() for one in path.paths):
         return True
-    if (path.noise**2 > _FOLLOWED**2 * _variation(problem)).any():
+    if (path.noise**2 > _FOLLOWED**2 * variance_read(problem)).any():
         return True
     assert found.priors.forces is not None  # effects were weighed
     own, d = problem.equations.momentum, problem.equations.declared  # what is unseen may come after it
@@ -213,24 +214,6 @@ def _first(problem: Problem) -> list[int]:
     return [min(n, _ROWS) for n in rows_fitted(problem.rows)]
 
 
-@np.errstate(all="ignore")  # a trajectory that ran away misses everything
 def _share(stepper: Stepper, z: Float[np.ndarray, "lane z"], rows: Sequence[int]) -> float:
-    """What share of their variation, in the mean over columns, the first rows of every recording are missed by along
-    the best trajectory."""
-    problem = stepper.problem
-    weight = weights(problem, rows)
-    errors = residuals(problem, stepper.predict(z, [()] * len(z), rows), weight)
-    number = sum((w > 0).sum(0) for w in weight)
-    square = sum((x**2).sum(1) for x in errors) / np.maximum(number, 1)
-    vary = _variation(problem)
-    some = np.isfinite(vary)
-    share = np.sqrt((square[:, some] / vary[some]).sum(1) / max(some.sum(), 1))
-    return float(np.min(np.where(np.isnan(share), np.inf, share)))
-
-
-def _variation(problem: Problem) -> Float[np.ndarray, " channel"]:
-    """Variance of every column's fitted readings, NaN where they do not vary."""
-    read = np.concatenate([r.readings[: r.fitted] for r in problem.rows])
-    seen = [column[~np.isnan(column)] for column in read.T]
-    vary = np.array([column.var() if len(column) else 0.0 for column in seen])
-    return np.where(vary > 0, vary, np.nan)
+    """What share of their variation the first rows of every recording are missed by along the best trajectory."""
+    return float(share_missed(stepper.problem, stepper.predict(z, [()] * len(z), rows), rows).min())

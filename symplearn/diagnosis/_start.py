@@ -11,6 +11,8 @@ from jaxtyping import Float, Int
 from ._along import along, along_all, force, readings, velocity
 from ._calibrate import Fits, Priors, calibrate, residuals, weights
 from ._drawn import around, scattered, within_the_motion
+from ._first_readings import on_first_readings
+from ._missed import share_missed
 from ._motion import rms
 from ._problem import Problem
 from ._trajectory import Predictions, Stepper
@@ -25,6 +27,8 @@ _WIDE = 10.0
 _ALIKE, _LARGE = 0.05, 0.9
 # Starts are tried for lying apart that are behind the best by so many nats at most.
 _HOPELESS = 15.0
+# The share of what readings vary by that first fits miss a few rows by where they have gone astray.
+_ASTRAY = 0.3
 # Relative round-off of forces a whole turn on.
 _ROUND_OFF = 1e-9
 
@@ -70,13 +74,16 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
     problem = stepper.problem
     short = [[min(n, least) for n in rows] for least in _SHORT]
     short += windows(rows, (0.02, 0.04, 0.08), max(_SHORT[-1], 4 * problem.state))
-    fits, nearby = _begun(stepper, priors, short, False), within_the_motion(problem, priors)
-    value = likelihood(problem, fits, short[-1])
+    drawn, nearby = scattered(problem, priors), within_the_motion(problem, priors)
+    fits = _begun(stepper, drawn, priors, short, False)
     if nearby is not priors:
         # The motion's size is an order of magnitude, and may be wrong: only what had gone astray is begun within it.
-        other = _begun(stepper, nearby, short, True)
-        if (better := likelihood(problem, other, short[-1])).min() < value.min() - 2 * _HOPELESS:
-            fits, value = other, better
+        fits = _better(problem, fits, _begun(stepper, drawn, nearby, short, True), short[-1])
+    if share_missed(problem, fits.predictions, short[-1]).min() > _ASTRAY:
+        fits = _better(
+            problem, fits, _begun(stepper, on_first_readings(problem, drawn), priors, short, False), short[-1]
+        )
+    value = likelihood(problem, fits, short[-1])
     ranked = np.argsort(value)
     near = int((value[ranked] <= value[ranked[0]] + 2 * _HOPELESS * len(rows)).sum())
     apart, alike = apart_first(fits.z[ranked, : problem.head], near)
@@ -85,10 +92,19 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
     return Fits([()] * _STARTS, z, fits.noise[order], [], fits.cost[order], fits.converged[order])
 
 
-def _begun(stepper: Stepper, priors: Priors, short: Sequence[Sequence[int]], is_careful: bool) -> Fits:
-    """Fits in one window after the other; with care from elsewhere, too, in the valley of the window before."""
+def _better(problem: Problem, fits: Fits, other: Fits, rows: Sequence[int]) -> Fits:
+    """The others where they are clearly likelier."""
+    value, its = (likelihood(problem, some, rows).min() for some in (fits, other))
+    return other if its < value - 2 * _HOPELESS else fits
+
+
+def _begun(
+    stepper: Stepper, drawn: np.ndarray, priors: Priors, short: Sequence[Sequence[int]], is_careful: bool
+) -> Fits:
+    """Fits from many starts in one window after the other; with care from elsewhere, too, in the valley of the one
+    before."""
     problem, tight = stepper.problem, _tightened(stepper.problem, priors)
-    fits = calibrate(stepper, _tried(stepper, priors, short[0]), [()] * _TRIED, tight, short[0], 40)
+    fits = calibrate(stepper, _tried(stepper, drawn, short[0]), [()] * _TRIED, tight, short[0], 40)
     for number, window in enumerate(short[1:], 1):
         before, held = short[number - 1], tight if number < len(_SHORT) + 1 else priors
         starts = [_recombined(problem, fits.z, fits.predictions, before)[:_STARTS]]
@@ -100,9 +116,8 @@ def _begun(stepper: Stepper, priors: Priors, short: Sequence[Sequence[int]], is_
     return fits
 
 
-def _tried(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Float[np.ndarray, "lane z"]:
+def _tried(stepper: Stepper, drawn: Float[np.ndarray, "draw z"], rows: Sequence[int]) -> Float[np.ndarray, "lane z"]:
     """Where the first fits begin: half as drawn, half those of many draws that follow a few rows best as they are."""
-    drawn = scattered(stepper.problem, priors)
     predictions = stepper.predict(drawn, [()] * len(drawn), rows)
     half = _TRIED // 2
     side_by_side = [(k,) * len(rows) for k in range(half)]
