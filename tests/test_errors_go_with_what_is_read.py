@@ -163,7 +163,7 @@ def test_a_scale_that_saturates_is_a_plain_curve(read, is_curve):
 @pytest.mark.slow
 def test_what_is_known_of_it_is_expected_of_later_rows():
     """Of a sensor that is off by three times its noise, later readings are predicted to a tenth more than the noise;
-    without it they are missed by twice the noise. The filter looks through the bend, so that both runs start alike."""
+    without it they are missed by twice the noise."""
     p, fits, priors = fitted(0.03, hold=0.4)
     rows = [p.rows[0].fitted]
     outlook = lambda one: Outlook(Stepper(p), one, 0, np.zeros(1))  # noqa: E731
@@ -173,9 +173,10 @@ def test_what_is_known_of_it_is_expected_of_later_rows():
         shown = outlook(one)
         missed[kind] = np.sqrt(np.mean((shown.readings - p.rows[0].readings)[rows[0] :] ** 2))
     assert missed["bent"] < 1.1 * NOISE and min(missed["white"], missed["unknown"]) > 2 * NOISE
-    # Errors of the noise's own size, of which the prediction is sure: as dense as white noise can be, but for a tenth.
+    # Errors a tenth larger than the noise, of which the prediction is sure, are less dense than white noise can be by
+    # half of 1.1^2 - 1 each. Seen: 0.103.
     least = norm.logpdf(NOISE * np.random.default_rng(2).normal(size=len(TIMES))[rows[0] :], scale=NOISE).sum()
-    assert outlook(bent).held_out(1.0).log_density > least - 0.1 * (len(TIMES) - rows[0])
+    assert outlook(bent).held_out(1.0).log_density > least - 0.105 * (len(TIMES) - rows[0])
 
 
 @pytest.mark.slow

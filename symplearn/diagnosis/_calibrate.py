@@ -130,6 +130,8 @@ class Fits:
     predictions: list[Predictions]
     cost: Float[np.ndarray, " lane"]  # minus twice the log posterior, up to a constant
     converged: Bool[np.ndarray, " lane"]
+    # Nats that one more step promises though the fit has ended, in a kink, where no step could take them.
+    unearned: Float[np.ndarray, " lane"] | None = None
 
 
 def weights(problem: Problem, rows: Sequence[int]) -> list[Float[np.ndarray, "_ channel"]]:
@@ -257,7 +259,12 @@ def calibrate(
             stuck |= ~done & is_hopeless(behind)
             done |= stuck
     rests = np.min(lately, axis=0, initial=np.inf) < _SLIGHT
-    return replace(fits, converged=(done & ~stuck | rests) & np.isfinite(fits.cost))
+    moved = np.nonzero(~(left < tolerance))[0]  # the last step may have led on
+    if len(moved):
+        given = precision[moved], mean[moved], active[moved], bounds[moved], damping[moved]
+        left[moved] = _steps(problem, _chosen(fits, moved), weight, *given)[1]
+    unearned = 0.5 * np.maximum(0.0, left - _SLIGHT)
+    return replace(fits, converged=(done & ~stuck | rests) & np.isfinite(fits.cost), unearned=unearned)
 
 
 def is_hopeless(behind: Sequence[Float[np.ndarray, " lane"]]) -> Bool[np.ndarray, " lane"]:

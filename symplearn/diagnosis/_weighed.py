@@ -64,6 +64,7 @@ class Estimate:
     modes: tuple[Mode, ...] = ()  # all optima that were found, this one among them
     outliers: tuple[tuple[float, float], ...] = ()  # share and size by channel, where they were left out
     promised: float = 0.0  # nats that the step to it is to bring, beside a remainder
+    unearned: float = 0.0  # nats that one more step promises though the fit has ended, under white noise
     owed: float | None = None  # nats added for what its errors of a clock were weighed with, once it is settled
     log_likelihood: float = np.nan  # of the readings at `z`, of a trajectory fit
 
@@ -110,6 +111,7 @@ def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -
                 bool(fits.converged[b]),
                 variance_inflation(scores),
                 log_likelihood=float(offset[b] - 0.5 * square[b]),
+                unearned=unearned(fits, b),
             )  # fmt: skip
         )
     return out
@@ -243,7 +245,12 @@ def amplitudes_out(
 
 def _earned(one: Laplace, fits: Fits, lane: int) -> float:
     """The log evidence, without what a step promises that no fit could take."""
-    return one.log_evidence - (0.0 if fits.converged[lane] else one.promised)
+    return one.log_evidence - min(one.promised, unearned(fits, lane) if fits.converged[lane] else np.inf)
+
+
+def unearned(fits: Fits, lane: int) -> float:
+    """Nats that one more step promises of a fit that has ended."""
+    return 0.0 if fits.unearned is None else float(fits.unearned[lane])
 
 
 def under_priors(problem: Problem, combination: Combination, gram, offset: float, z, priors: Priors) -> Laplace:

@@ -207,11 +207,12 @@ class Weigher:
         z, own = np.stack([one.z for one in whites]), [one.combination for one in whites]
         predictions = self.stepper.predict(z, own, self.rows)
         noise, converged = np.stack([one.noise for one in whites]), np.array([one.converged for one in whites])
-        return Fits(own, z, noise, predictions, np.zeros(len(z)), converged)
+        unearned = np.array([one.unearned for one in whites])
+        return Fits(own, z, noise, predictions, np.zeros(len(z)), converged, unearned)
 
     def _whites(self, fits: Fits, rows: list[int]) -> np.ndarray:
         """Log evidences under white noise, by lane, with what unfinished fits promise."""
-        fits = replace(fits, converged=np.ones(len(fits.z), bool))
+        fits = replace(fits, converged=np.ones(len(fits.z), bool), unearned=None)
         return np.array([e.log_evidence for e in weigh_white(self.problem, fits, self.found.priors, rows)])
 
     def _add(self, estimate: Estimate, value: float, told: tuple[tuple[float, float], ...]) -> None:
