@@ -51,7 +51,7 @@ def searched(
     """
     given = recordings
     laid = _laid_out(file, recordings, options)
-    units = in_another_time(file, recordings, laid.stepper, laid.seeds.z, options)
+    units = in_another_time(file, recordings, laid.stepper, laid.seeds.z, options, deadline)
     search, steps = _begun(laid, options, deadline)
     for _ in range(_ANEW):
         shown = without_the_time_before(search.stepper, search.found, recordings)

@@ -5,6 +5,7 @@ are converted the simulation as it is follows them, which is told beside the ans
 """
 
 import itertools
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -22,7 +23,7 @@ from ._found import Found
 from ._missed import share_missed, variance_read
 from ._options import Options
 from ._problem import Problem
-from ._start import first_fits, priors_without_effects, windows
+from ._start import beginning, first_fits, priors_without_effects, windows
 from ._trajectory import Stepper
 
 # What readings and times may have been multiplied by, and how that comes about.
@@ -45,8 +46,6 @@ _AS_WELL = 1.5
 # Windows in which trajectories are fitted, by share of the rows, and how many are.
 _GROWTH, _STARTS = (0.16, 0.32, 0.64, 1.0), 4
 _CHECK = "check units, signs and columns before anything else"
-# The share of the rows, and how many at least, that the first fits have to follow; otherwise other times are tried.
-_BEGINNING, _FEW = 0.08, 14
 
 
 @dataclass(frozen=True)
@@ -59,17 +58,19 @@ class _Conversion:
 
 def in_another_time(
     file: SimulationFile, recordings: Sequence[Recording], stepper: Stepper, z: Float[np.ndarray, "lane z"],
-    options: Options,
+    options: Options, deadline: float,
 ) -> list[str]:  # fmt: skip
     """A sentence, told at once, where the first fits do not even follow a few rows, and the simulation follows many
     once the times are converted: the search takes many times as long then, and may find a motion among so many swings
     between two rows that follows them as well."""
-    few = windows(rows_fitted(stepper.problem.rows), (_BEGINNING,), max(_FEW, 4 * stepper.problem.state))[0]
+    few = beginning(stepper.problem, rows_fitted(stepper.problem.rows))
     if _share(stepper, z[:_STARTS], few) < _FOLLOWED:
         return []
     options.progress("trying whether the time is in another unit")
     missed = _missed(file, recordings, options)
     for one in _in_other_times(file, recordings):
+        if time.monotonic() > deadline:
+            break
         share = _missed(file, one.recordings, options)
         if share < _CLEARLY * min(1.0, missed):
             options.notice(f"{_told(one, share, missed)}: stop here and convert them, if that is what they are")

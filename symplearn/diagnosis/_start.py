@@ -21,6 +21,8 @@ from ._trajectory import Predictions, Stepper
 _TRIED, _STARTS = 64, 16
 # Rows of the first windows, at least so many.
 _SHORT = (8, 14)
+# Shares of the rows in the windows after them.
+_FIRST = (0.02, 0.04, 0.08)
 # Where nothing is known: this many times the size of what was found.
 _WIDE = 10.0
 # Starts that differ by less than this share of their size are one; a size that few of them exceed.
@@ -64,6 +66,15 @@ def windows(rows: Sequence[int], fractions: Sequence[float], least: int) -> list
     return [[max(min(least, n), round(n * fraction)) for n in rows] for fraction in fractions]
 
 
+def beginning(problem: Problem, rows: Sequence[int]) -> list[int]:
+    """Of so many rows of every recording those that the first fits follow in the end."""
+    return windows(rows, _FIRST[-1:], _least(problem))[0]
+
+
+def _least(problem: Problem) -> int:
+    return max(_SHORT[-1], 4 * problem.state)
+
+
 @np.errstate(all="ignore")  # a lane that ran away is told by its cost
 def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
     """Calibrate initial states, then everything, in short windows from many starts; the best lane comes first.
@@ -73,7 +84,7 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
     """
     problem = stepper.problem
     short = [[min(n, least) for n in rows] for least in _SHORT]
-    short += windows(rows, (0.02, 0.04, 0.08), max(_SHORT[-1], 4 * problem.state))
+    short += windows(rows, _FIRST, _least(problem))
     drawn, nearby = scattered(problem, priors), within_the_motion(problem, priors)
     fits = _begun(stepper, drawn, priors, short, False)
     if nearby is not priors:
