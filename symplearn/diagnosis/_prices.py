@@ -5,11 +5,14 @@ from functools import cached_property
 
 import numpy as np
 
-from .._effects import IMPULSE, OUTLIERS, prices
+from .._effects import ERROR, IMPULSE, OUTLIERS, prices
 from ._problem import Combination, Problem
 
 # Prior share of a change in time that begins anew in every one of several recordings.
 _ANEW = 1.0 / 30.0
+# Prior share of a known value's being wrong in all recordings: parameters are shared (contract, section 2), and what is
+# known of one is known of the system.
+_SHARED = 0.9
 # What has no name is there where no name explains it (contract, section 3): beside some of these, the prior of both is
 # this share of their product. Of three laws that were told so in the fourteenth exam by another hand none was right.
 _BESIDE_NAMES = 0.2
@@ -53,14 +56,17 @@ class Prices:
     def _share(self, member: int) -> float:
         """Of an effect and target's prior, half goes to all recordings and the rest to the choices among them.
 
-        Little of it where a change in time would have to begin anew in every recording, as their clocks do.
+        Little of it where a change in time would have to begin anew in every recording, as their clocks do; most of it
+        of a value that is known of the system.
         """
         variants, one = len(self.problem.variants(member)), self.problem.candidate(member)
         if one.effect is IMPULSE:
             return 1.0 / len(self.problem.rows)
         if variants == 0 or one.effect.amplitudes == 0:  # a noise is one in all recordings
             return 1.0
-        every = _ANEW if one.effect.family == "time variation" and self._clocks_overlap else 0.5
+        every = _SHARED if one.effect is ERROR else 0.5
+        if one.effect.family == "time variation" and self._clocks_overlap:
+            every = _ANEW
         return every if member == self.problem.whole(member) else (1.0 - every) / variants
 
     @cached_property
