@@ -51,12 +51,21 @@ def test_an_unfinished_fit_claims_nothing(stepper, priors):
     begun = calibrate(stepper, priors.mean[None], [()], priors, rows, iterations=0)
     assert done.converged[0] and not begun.converged[0]
     (best,) = weigh_white(stepper.problem, done, priors, rows)
-    (claimed,) = weigh_white(stepper.problem, replace(begun, converged=np.array([True])), priors, rows)
+    (claimed,) = weigh_white(stepper.problem, replace(begun, converged=np.array([True]), unearned=None), priors, rows)
     (owned,) = weigh_white(stepper.problem, begun, priors, rows)
     # What differs is half of what the fit took off the cost, and the spread of two Gram matrices at either end: 0.3
     # leaves that two fifths of the half.
     assert best.log_evidence - owned.log_evidence > 0.3 * (begun.cost[0] - done.cost[0]) > 10
     assert owned.log_evidence < claimed.log_evidence - 10
+
+
+def test_a_fit_that_ended_in_a_kink_claims_hardly_more(stepper, priors):
+    """Of what a step promises a fit that has ended all the same, as where no step keeps what it promises, earns half a
+    nat."""
+    begun = calibrate(stepper, priors.mean[None], [()], priors, [len(TIMES)], iterations=0)
+    ended = replace(begun, converged=np.array([True]))
+    (at_rest,), (owned,) = (weigh_white(stepper.problem, fits, priors, [len(TIMES)]) for fits in (ended, begun))
+    assert at_rest.log_evidence == pytest.approx(owned.log_evidence + 0.5, abs=1e-9)
 
 
 def test_a_promise_is_weighed_with_the_errors_that_it_leaves(stepper, priors):
@@ -67,7 +76,9 @@ def test_a_promise_is_weighed_with_the_errors_that_it_leaves(stepper, priors):
     begun = calibrate(stepper, z[None], [()], priors, [len(TIMES)], iterations=0)
     errors = stepper.problem.rows[0].readings[:, 0] - begun.predictions[0].readings[0, :, 0]
     assert np.sqrt(np.mean(errors**2)) > 10 * GIVEN
-    (claimed,) = weigh_white(stepper.problem, replace(begun, converged=np.array([True])), priors, [len(TIMES)])
+    (claimed,) = weigh_white(
+        stepper.problem, replace(begun, converged=np.array([True]), unearned=None), priors, [len(TIMES)]
+    )
     # No reading is likelier than at the peak of the narrower law, Student's of five degrees of freedom.
     assert claimed.log_evidence < len(TIMES) * student.logpdf(0.0, 5, scale=np.sqrt(3 / 5) * GIVEN)
 

@@ -93,7 +93,7 @@ def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -
         one = under_priors(problem, combination, gram, offset[b], fits.z[b], priors)
         scores = _scores(problem, fits, b, r, weight)
         # Errors as they are where the evidence is taken: after the step that a fit which is done is granted.
-        taken = one.step if fits.converged[b] else np.zeros(problem.size)
+        taken = one.step if fits.converged[b] and not unearned(fits, b) else np.zeros(problem.size)
         left = [x[b] - np.einsum("i,itj->tj", taken[problem.local(k)], p.slopes[b])
                 for k, (x, p) in enumerate(zip(r, fits.predictions, strict=True))]  # fmt: skip
         errors = standardised(left, weight, fits.noise[b])
