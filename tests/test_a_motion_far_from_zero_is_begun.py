@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from symplearn.diagnosis._drawn import scattered
-from symplearn.diagnosis._first_readings import on_first_readings
 from symplearn.diagnosis._missed import share_missed
-from symplearn.diagnosis._start import first_fits, priors_without_effects
+from symplearn.diagnosis._start import first_fits, on_first_readings, priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
 
 TIMES = np.arange(0.0, 60.0, 0.4)
@@ -38,7 +37,8 @@ def test_a_population_is_begun_by_its_logarithm(eaten, fed):
     stepper = Stepper(problem, 1)
     fits = first_fits(stepper, priors_without_effects(problem), [problem.rows[0].fitted])
     begin = fits.z[0, [0, problem.equations.width]]
-    # Twelve rows leave the start open by some per cent.
+    # The noise of 3 % leaves the start open in the few rows that are followed: 0.011 was seen. From anywhere else the
+    # hunters alone are off by millions.
     np.testing.assert_allclose(begin, np.log(counted[0]), atol=0.1)
 
 
@@ -46,11 +46,13 @@ def test_starts_read_what_was_read_first():
     """Nearly all drawn starts are moved to where they read the first reading; what no reading depends on stays as it
     was drawn."""
     _, problem = hunted(0.04, 0.02)
-    drawn = scattered(problem, priors_without_effects(problem))
-    moved = on_first_readings(problem, drawn)
+    priors = priors_without_effects(problem)
+    drawn = scattered(problem, priors)
+    moved = on_first_readings(Stepper(problem, 1), drawn, priors)
     width = problem.equations.width
     first = problem.rows[0].readings[0, 0]
-    # From far below exp is flat, and from far above it overflows. Seen: 96 % of those within five of zero.
+    # From far above exp overflows, and nothing is moved. Of those within five of zero all read it to 1e-10; a start that
+    # does to 1e-6 is as good, far within the noise.
     within = np.abs(drawn[:, 0]) < 5.0
     assert np.isclose(np.exp(moved[within, 0]), first, rtol=1e-6).mean() > 0.9
     np.testing.assert_array_equal(moved[:, width:], drawn[:, width:])
@@ -60,8 +62,9 @@ def test_what_is_known_of_a_start_stays():
     """A start of known mean and spread stays as it was drawn."""
     file = cases.simulation("p**2/2 + q**2/2", more="[initial]\nq = { value = 1.0, sd = 0.1 }\np = 0.0")
     problem = cases.problem(file, [cases.recorded(TIMES, 5.0 + np.cos(TIMES))], SUBSTEP)
-    drawn = scattered(problem, priors_without_effects(problem))
-    np.testing.assert_array_equal(on_first_readings(problem, drawn), drawn)
+    priors = priors_without_effects(problem)
+    drawn = scattered(problem, priors)
+    np.testing.assert_array_equal(on_first_readings(Stepper(problem, 1), drawn, priors), drawn)
 
 
 def test_shares_are_of_what_readings_vary_by():
@@ -72,5 +75,5 @@ def test_shares_are_of_what_readings_vary_by():
     rows = [problem.rows[0].fitted]
     shares = share_missed(problem, Stepper(problem, 1).predict(lanes, [()] * 2, rows), rows)
     read = np.cos(TIMES[: rows[0]])
-    # Steps of the integrator err by some 1e-4 of the swing.
+    # Steps of the integrator make 3e-6; shares are held against a tenth at least.
     np.testing.assert_allclose(shares, [np.sqrt(np.mean(read**2)) / read.std(), 0.0], atol=1e-3)

@@ -122,5 +122,6 @@ def test_the_stiffness_of_a_hard_stop_is_that_of_its_profile(seed):
     (finding,) = document["findings"]
     k = finding["coefficients"]["k"]
     assert finding["effect"] == "contact_stop" and k["interval95"][0] < 400.0 < k["interval95"][1]
-    # A normal density about the likeliest stiffness stands for a skewed one: 0.40 of its sd and 22 % were seen.
+    # A normal density about the likeliest stiffness stands for a skewed one, whose mean lies above it and which is
+    # wider: by 0.40 of its sd and 22 % at most in these two.
     assert abs(k["mean"] - mean) < 0.5 * sd and k["sd"] == pytest.approx(sd, rel=0.3)

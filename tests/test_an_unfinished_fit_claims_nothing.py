@@ -65,6 +65,7 @@ def test_a_fit_that_ended_in_a_kink_claims_hardly_more(stepper, priors):
     begun = calibrate(stepper, priors.mean[None], [()], priors, [len(TIMES)], iterations=0)
     ended = replace(begun, converged=np.array([True]))
     (at_rest,), (owned,) = (weigh_white(stepper.problem, fits, priors, [len(TIMES)]) for fits in (ended, begun))
+    # Round-off of sums of some tens.
     assert at_rest.log_evidence == pytest.approx(owned.log_evidence + 0.5, abs=1e-9)
 
 

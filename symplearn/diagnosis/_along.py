@@ -63,21 +63,6 @@ def along(
     return np.asarray(_mapped(problem.equations, what, *given, *moving))[:n]
 
 
-def at_row(
-    problem: Problem,
-    what: What,
-    recording: int,
-    row: int,
-    z: Float[np.ndarray, " z"],
-    states: Float[np.ndarray, "point state"],
-) -> np.ndarray:
-    """The same without effects at many phase points of one row."""
-    rows = problem.rows[recording]
-    given = (problem.parameter_values(recording, z), problem.coefficients(recording, z, ()))
-    there = (np.tile(rows.inputs[row], (len(states), 1)), np.full(len(states), rows.times[row]))
-    return np.asarray(_mapped(problem.equations, what, *given, states, *there))
-
-
 @partial(jax.jit, static_argnums=(0, 1))
 def _mapped(equations: Any, what: Any, parameters: Array, coefficients: Array, states: Array, inputs: Array, times):
     system = Simulated(equations, parameters, coefficients)

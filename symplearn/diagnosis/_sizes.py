@@ -53,7 +53,7 @@ def _sizes_about(
 ) -> Float[np.ndarray, " state"]:
     """The same by displacements from one phase point."""
     width, d, out = problem.equations.width, problem.equations.dim, np.full(problem.state, np.nan)
-    time, shown = variation(problem, r)[1], _sizes_read(problem, z, r, begin)
+    time, shown = _variation(problem, r)[1], _sizes_read(problem, z, r, begin)
     pace = np.array([_slope(_moved(problem, velocity, r, z, begin, width + i)[:, i]) for i in range(d)])
     out[:d], out[width : width + d] = shown[:d], shown[width : width + d]
     q, p = out[:d], out[width : width + d]
@@ -67,11 +67,11 @@ def _sizes_read(
     problem: Problem, z: Float[np.ndarray, " z"], r: int, begin: Float[np.ndarray, " state"]
 ) -> Float[np.ndarray, " state"]:
     """What moves a reading by what the readings vary, NaN where nothing does."""
-    vary, _ = variation(problem, r)
+    vary, _ = _variation(problem, r)
     return np.array([_shown(_moved(problem, readings, r, z, begin, i), vary) for i in range(problem.state)])
 
 
-def variation(problem: Problem, r: int) -> tuple[Float[np.ndarray, " channel"], float]:
+def _variation(problem: Problem, r: int) -> tuple[Float[np.ndarray, " channel"], float]:
     """How much every channel varies, NaN where it does not, and in what time."""
     rows = problem.rows[r]
     y, t = rows.readings[: rows.fitted], rows.times[: rows.fitted]

@@ -11,7 +11,6 @@ from jaxtyping import Float, Int
 from ._along import along, along_all, force, readings, velocity
 from ._calibrate import Fits, Priors, calibrate, residuals, weights
 from ._drawn import around, scattered, within_the_motion
-from ._first_readings import on_first_readings
 from ._missed import share_missed
 from ._motion import rms
 from ._problem import Problem
@@ -91,9 +90,8 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
         # The motion's size is an order of magnitude, and may be wrong: only what had gone astray is begun within it.
         fits = _better(problem, fits, _begun(stepper, drawn, nearby, short, True), short[-1])
     if share_missed(problem, fits.predictions, short[-1]).min() > _ASTRAY:
-        fits = _better(
-            problem, fits, _begun(stepper, on_first_readings(problem, drawn), priors, short, False), short[-1]
-        )
+        moved = on_first_readings(stepper, drawn, priors)
+        fits = _better(problem, fits, _begun(stepper, moved, priors, short, False), short[-1])
     value = likelihood(problem, fits, short[-1])
     ranked = np.argsort(value)
     near = int((value[ranked] <= value[ranked[0]] + 2 * _HOPELESS * len(rows)).sum())
@@ -101,6 +99,22 @@ def first_fits(stepper: Stepper, priors: Priors, rows: Sequence[int]) -> Fits:
     order = ranked[[*apart, *alike]]
     z = np.stack([without_turns(problem, z) for z in fits.z[order]])
     return Fits([()] * _STARTS, z, fits.noise[order], [], fits.cost[order], fits.converged[order])
+
+
+@np.errstate(all="ignore")  # a lane that ran away
+def on_first_readings(
+    stepper: Stepper, drawn: Float[np.ndarray, "lane z"], priors: Priors
+) -> Float[np.ndarray, "lane z"]:
+    """The same with what is unknown of initial states moved to where it reads what was read first. Starts are drawn
+    about zero; a motion far from there, as of a population that is simulated by its logarithm, is reached by none where
+    what is far off runs away within a few rows."""
+    problem = stepper.problem
+    first = [int((r.counts > 0).any(1).argmax()) + 1 for r in problem.rows]
+    fits = calibrate(stepper, drawn, [()] * len(drawn), _tightened(problem, priors), first)
+    unknown = np.flatnonzero(np.tile(np.isinf(problem.initial.sd), len(problem.rows)))
+    moved = drawn.copy()
+    moved[:, unknown] = fits.z[:, unknown]
+    return moved
 
 
 def _better(problem: Problem, fits: Fits, other: Fits, rows: Sequence[int]) -> Fits:
