@@ -51,8 +51,8 @@ def test_starts_read_what_was_read_first():
     moved = on_first_readings(Stepper(problem, 1), drawn, priors)
     width = problem.equations.width
     first = problem.rows[0].readings[0, 0]
-    # From far above exp overflows, and nothing is moved. Of those within five of zero all read it to 1e-10; a start that
-    # does to 1e-6 is as good, far within the noise.
+    # From far above exp overflows, and nothing is moved. Of those within five of zero all read it to 1e-10; a start
+    # that does to 1e-6 is as good, far within the noise.
     within = np.abs(drawn[:, 0]) < 5.0
     assert np.isclose(np.exp(moved[within, 0]), first, rtol=1e-6).mean() > 0.9
     np.testing.assert_array_equal(moved[:, width:], drawn[:, width:])
