@@ -19,7 +19,7 @@ def test_a_clock_that_wanders_does_not_shorten_the_steps():
     readings = q + 2e-5 * np.random.default_rng(2).normal(size=len(q))
     file = cases.simulation("p**2/2 + k*q**2/2", more="[parameters]\nk = { value = 1.0, sd = 0.1 }\n")
     options = Options(restriction=Restriction(("quadratic_drag",)))
-    found, stepper, _ = searched(file, [cases.recorded(TIMES, readings)], options, np.inf)
+    found, stepper, *_ = searched(file, [cases.recorded(TIMES, readings)], options, np.inf)
     (best,) = [c for c in found.estimates if found.odds(c) == max(map(found.odds, found.estimates))]
     told = speaker(found.estimates[best])
     assert told.kind == "clock" and told.noise < 1e-4 and found.is_fine

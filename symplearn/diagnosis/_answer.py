@@ -1,6 +1,6 @@
 """Everything that is said about a finished search."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -12,7 +12,6 @@ from .._simulation_records import SimulationFile
 from . import _document as document
 from ._along import along, energy, force
 from ._augment import augmented
-from ._build import rows_fitted
 from ._effect_priors import STRENGTH
 from ._forecast import forecast
 from ._found import Found
@@ -29,17 +28,17 @@ from ._locate import (
     where_sentence,
     whole_windows,
 )
-from ._next import NOTHING_SHOWN, all_rows, next_measurement
+from ._next import ALL_ROWS, NOTHING_SHOWN, all_rows, next_measurement
 from ._options import Options
 from ._outlook import Outlook, intensity_of
-from ._posterior import CONSISTENT, Posterior, Weighed, posterior
 from ._problem import Combination, Problem
 from ._record import Diagnosis, Forecast, Series
 from ._told import Told
 from ._trajectory import Stepper
 from ._units import coefficient_units, time_unit
-from ._warnings import doubled, idle_units, missed, set_back, unused, warnings
-from ._weighed import Estimate, coloured_inflation
+from ._verdict import judged
+from ._warnings import asks_for_more, doubled, idle_units, missed, set_back, unused, warnings
+from ._weighed import Estimate
 from ._words import finding_sentence
 
 VERSION = "0.1.0"
@@ -58,17 +57,13 @@ class Answer:
 
     def __init__(
         self, file, recordings, stepper: Stepper, found: Found, options: Options, times: np.ndarray | None,
-        notes: Sequence[str] = (),
+        notes: Sequence[str] = (), all_rows: Mapping[str, Any] | None = None,
     ):  # fmt: skip
-        self.times, self.notes = times, notes
+        """`all_rows` is what they say, where that is another answer."""
+        self.times, self.notes, self.all_rows = times, notes, all_rows
         self.file, self.recordings, self.stepper, self.found, self.options = file, recordings, stepper, found, options
         self.problem: Problem = stepper.problem
-        self.posterior: Posterior = posterior(self.problem, found, 1.0)
-        self.chosen, self.verdict = self._verdict()
-        inflation = self._inflation()
-        if inflation > 1:
-            self.posterior = posterior(self.problem, found, inflation)
-            self.chosen, self.verdict = self._verdict()
+        self.posterior, self.chosen, self.verdict = judged(stepper, found)
         self.before: Estimate = self.posterior.nothing
         self.after, self.run = self._after()
         # Shown before: the calibrated simulation as it is, which knows no missing force.
@@ -90,21 +85,6 @@ class Answer:
         """The simulation without effects beside a missing force, with outliers taken out where there were some."""
         bare = [c for c in self.found.estimates if all(self.problem.candidate(m).effect is OUTLIERS for m in c)]
         return next((e for c in sorted(bare, key=len) if (e := self.found.of(c, "force"))), None)
-
-    def _inflation(self) -> float:
-        """How much the evidence of the likeliest answer claims too much."""
-        rows = rows_fitted(self.problem.rows)
-        top = self.chosen.best if self.chosen else self.posterior.nothing
-        return coloured_inflation(self.stepper, top, rows) if top.kind == "coloured" else max(1.0, top.inflation)
-
-    def _verdict(self) -> tuple[Weighed | None, str]:
-        p = self.posterior
-        if p.as_it_is >= CONSISTENT:
-            return None, "consistent"
-        ranked = document.told_apart(self.problem, p.named)
-        if not ranked or p.unexplained > ranked[0].probability:
-            return None, "unexplained"
-        return ranked[0], "mismatch"
 
     def _outlooks(self, estimate: Estimate) -> list[Outlook]:
         """Under the remainder that it was fitted with."""
@@ -188,7 +168,9 @@ class Answer:
                 self.forecast,
             )
             + set_back(before, after)
-            + missed(after),
+            + missed(after)
+            + asks_for_more(self.all_rows),
+            "all_rows": self.all_rows,
             "thinning": {
                 "rows": sum(r.given for r in self.problem.rows),
                 "used": sum(r.used for r in self.problem.rows),
@@ -203,6 +185,8 @@ class Answer:
         p = self.posterior
         if p.is_constant:
             return NOTHING_SHOWN
+        if self.all_rows is not None:
+            return ALL_ROWS
         top = max((w.probability for w in p.named), default=0.0)
         rivals = [[one.key for m in w.combination for one in self.problem.candidate(m).told()]
                   for w in p.named if w.probability > max(0.02, 0.1 * top)][:6]  # fmt: skip

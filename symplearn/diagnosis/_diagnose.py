@@ -62,9 +62,9 @@ def _diagnosed(file: SimulationFile, recordings: Sequence[Recording], options: O
     check_readings(file, recordings)
     times = _times_ahead(file, recordings[0], options)
     recordings, notes = unwrapped(file, recordings)
-    found, stepper, told = searched(file, recordings, options, begin + options.time_limit)
+    found, stepper, told, all_rows = searched(file, recordings, options, begin + options.time_limit)
     options.progress("comparing before and after on the held-out rows")
-    answer = Answer(file, recordings, stepper, found, options, times, [*told, *notes])
+    answer = Answer(file, recordings, stepper, found, options, times, [*told, *notes], all_rows)
     return answer.diagnosis(time.monotonic() - begin)
 
 

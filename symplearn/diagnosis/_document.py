@@ -118,20 +118,20 @@ def alternatives(
     problem: Problem, posterior: Posterior, verdict: str, chosen: Weighed | None
 ) -> tuple[list[Any], float]:
     """Everything weighed beside the reported combination, likeliest first, and what is left over."""
-    rows = [_alternative(problem, w.combination, False, w.probability) for w in told_apart(problem, posterior.named)
+    rows = [alternative(problem, w.combination, False, w.probability) for w in told_apart(problem, posterior.named)
             if chosen is None or w.combination != chosen.combination]  # fmt: skip
     rows = [row for row in rows if row["probability"] > _LEAST][:_LISTED]
     if verdict != "unexplained":
-        rows.append(_alternative(problem, (), True, posterior.unexplained))
+        rows.append(alternative(problem, (), True, posterior.unexplained))
     if verdict != "consistent":
-        rows.append(_alternative(problem, (), False, posterior.as_it_is))
+        rows.append(alternative(problem, (), False, posterior.as_it_is))
     rows.sort(key=lambda row: -row["probability"])
     reported = {"consistent": posterior.as_it_is, "unexplained": posterior.unexplained}.get(verdict)
     reported = chosen.probability if reported is None and chosen is not None else reported
     return rows, max(0.0, 1.0 - float(reported or 0.0) - sum(row["probability"] for row in rows))
 
 
-def _alternative(problem: Problem, combination, unexplained: bool, probability: float) -> dict[str, Any]:
+def alternative(problem: Problem, combination, unexplained: bool, probability: float) -> dict[str, Any]:
     found = [one for member in combination for one in problem.candidate(member).told()]
     return {
         "findings": [{"effect": one.effect.name, "target": one.target} for one in found],

@@ -3,6 +3,7 @@ no name fits."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from ._ahead import look_ahead
 from ._build import build, equations_for, first_substep, refined, rows_fitted
 from ._calibrate import Fits
 from ._found import Found, doubtful_outliers, speaker
+from ._kept_back import of_all_rows, promises_more
 from ._lasting import total_noise
 from ._late import left_out, without_the_time_before
 from ._nameless import is_clear, weigh_nameless
@@ -24,6 +26,7 @@ from ._search import Search
 from ._start import first_fits, priors_without_effects
 from ._trajectory import Stepper
 from ._usable import check_columns, check_fitted, check_motion, check_searched, check_steps
+from ._verdict import judged
 
 # Third differences show the noise and some of the motion: the share of them that counts as noise at least.
 _ROUGH = 0.3
@@ -43,9 +46,10 @@ class _Laid:
 
 def searched(
     file: SimulationFile, recordings: Sequence[Recording], options: Options, deadline: float
-) -> tuple[Found, Stepper, list[str]]:
+) -> tuple[Found, Stepper, list[str], dict[str, Any] | None]:
     """Lay the problem out with substeps that are fine enough, and search; once more where what is found needs finer,
-    or shows readings to be of another time, which is told in sentences, as other units are.
+    or shows readings to be of another time, which is told in sentences, as other units are. At last what
+    all rows say, the held-out ones too, where that is another answer.
 
     `InputError` where there is nothing to fit, to search or to step.
     """
@@ -71,7 +75,8 @@ def searched(
     look_ahead(search.stepper, found, search.rows)
     found.is_fine = steps[1]
     units = units or in_other_units(file, given, search.stepper, found, options)
-    return found, search.stepper, [*units, *left_out(search.problem, found, given, recordings)]
+    told = [*units, *left_out(search.problem, found, given, recordings)]
+    return found, search.stepper, told, _with_all_rows(laid, search, steps[0], options, deadline)
 
 
 def _laid_out(file: SimulationFile, recordings: Sequence[Recording], options: Options) -> _Laid:
@@ -79,8 +84,8 @@ def _laid_out(file: SimulationFile, recordings: Sequence[Recording], options: Op
     built = equations_for(file, recordings, options.restriction)
     substep = first_substep(file, recordings)
 
-    def rebuild(longest: float, equations: Equations = built) -> Problem:
-        return build(file, equations, recordings, options.holdout, longest, options.restriction)
+    def rebuild(longest: float, equations: Equations = built, holdout: float = options.holdout) -> Problem:
+        return build(file, equations, recordings, holdout, longest, options.restriction)
 
     problem = rebuild(substep)
     check_fitted(file, problem, options.holdout)
@@ -104,6 +109,21 @@ def _begun(
     stepper = laid.stepper if finer is problem else Stepper(finer, options.jobs)
     search = _run(stepper, seeds.z, deadline, options, earlier)
     return search, _refined(search, laid.rebuild, (substep, is_fine), options)
+
+
+def _with_all_rows(
+    laid: _Laid, search: Search, longest: float, options: Options, deadline: float
+) -> dict[str, Any] | None:
+    """What all rows say where the fitted ones agree with the simulation, and all of them promise an effect."""
+    if options.holdout <= 0 or not search.in_time() or judged(search.stepper, search.found)[2] != "consistent":
+        return None
+    options.progress("asking all rows, the held-out ones too")
+    stepper = Stepper(laid.rebuild(longest, search.problem.equations, 0.0), options.jobs)
+    if not promises_more(stepper, search.found):
+        return None
+    options.progress("searching once more, with the held-out rows among the fitted ones")
+    whole = _run(stepper, search.beginning.seeds, deadline, options)
+    return of_all_rows(whole.stepper, whole.found)
 
 
 def _refined(

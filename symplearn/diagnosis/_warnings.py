@@ -155,6 +155,23 @@ def missed(fit: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def asks_for_more(all_rows: Mapping[str, Any] | None) -> list[str]:
+    """That the held-out rows hold what the fitted ones do not, of what `all_rows` tells."""
+    if all_rows is None:
+        return []
+    one = all_rows["likeliest"]
+    names = [f"{found['effect']} of {_targets(found['target'])}" for found in one["findings"]]
+    return [
+        "the held-out rows ask for more: with them among the fitted ones nothing left out has a probability of "
+        f"{all_rows['as_it_is']:.2g}, and {' and '.join(names) or 'something without a name'} one of "
+        f"{one['probability']:.2g}; ask again with --holdout 0"
+    ]
+
+
+def _targets(target: str | Sequence[str]) -> str:
+    return target if isinstance(target, str) else " and ".join(target)
+
+
 def _same(recordings: Sequence[Recording]) -> list[tuple[int, int]]:
     """Numbers of recordings that are copies of one another."""
     return [

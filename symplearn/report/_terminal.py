@@ -18,7 +18,8 @@ def summary(diagnosis: Diagnosis, directory: Path) -> Text:
     is no terminal.
     """
     document, text = diagnosis.document, Text()
-    text.append(verdict_sentence(diagnosis) + "\n", style=_COLOURS.get(document["verdict"], "bold"))
+    colour = _COLOURS["mismatch" if document["all_rows"] else document["verdict"]]
+    text.append(verdict_sentence(diagnosis) + "\n", style=colour)
     if not document["converged"]:
         text.append(PROBLEM + "\n", style="bold red")
     text.append(f"Where: {plain(document['location']['where'])}\n")

@@ -14,6 +14,8 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
     """One sentence with the probability of the reported combination."""
     document = diagnosis.document
     chance = f"probability {probability(document['probability'])}"
+    if document["all_rows"] is not None:
+        return f"The simulation agrees with the rows that were fitted, and not with all of them ({chance})."
     if document["verdict"] == "consistent" and document["probability"] < 0.5:
         return f"The recording rules out neither the simulation as it is nor that it lacks something ({chance})."
     if document["verdict"] == "consistent":
