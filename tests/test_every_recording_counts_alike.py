@@ -6,7 +6,7 @@ import engine_cases as cases
 import numpy as np
 import pytest
 
-from symplearn.diagnosis._null_paths import rough_noise
+from symplearn.diagnosis._missed import rough_noise
 from symplearn.diagnosis._weighed import largest
 
 TIMES = np.linspace(0.0, 10.0, 201)

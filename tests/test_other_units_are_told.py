@@ -138,6 +138,14 @@ def pushed(torque, _, x):
     return [x[1], -20 * np.sin(x[0]) + torque]
 
 
+def test_no_unit_is_tried_for_a_column_of_hardly_more_than_noise():
+    """Of two readings of a swing one is mostly noise: whatever follows the other misses it, by nothing but that."""
+    faint = 0.02 * swing() + 0.03 * np.random.default_rng(7).normal(size=len(TIMES))
+    file = cases.simulation("p**2/2 - 20*cos(q)", observe={"y0": "q", "y1": "0.02*q"})
+    warnings, said = asked(file, TIMES, np.stack([swing(), faint], axis=1))
+    assert not any("unit" in one for one in said) and not any("divided by" in one for one in warnings)
+
+
 @pytest.mark.slow
 def test_no_unit_is_tried_where_nothing_as_strong_as_all_that_is_there_is_missing():
     """Where a strong damping, or nothing, is missing nothing is converted; where a force as strong as those there is,

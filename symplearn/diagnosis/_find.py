@@ -17,8 +17,8 @@ from ._found import Found, doubtful_outliers, speaker
 from ._kept_back import of_all_rows, promises_more
 from ._lasting import total_noise
 from ._late import left_out, without_the_time_before
+from ._missed import rough_noise
 from ._nameless import is_clear, weigh_nameless
-from ._null_paths import rough_noise
 from ._options import Options
 from ._other_units import in_another_time, in_other_units
 from ._problem import Problem

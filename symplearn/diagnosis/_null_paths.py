@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ._calibrate import Priors
+from ._missed import rough_noise
 from ._motion import extent
 from ._noisy import PathFit, fit_paths
 from ._problem import Combination, Problem
@@ -68,20 +69,6 @@ def intensity(problem: Problem, rows: Sequence[int], typical: np.ndarray, share:
     """Squared force times the time over which it would be felt: a tenth of the shortest recording's length."""
     length = min(r.times[n - 1] - r.times[0] for r, n in zip(problem.rows, rows, strict=True))
     return (share * np.maximum(typical, 1e-300)) ** 2 * length / 10
-
-
-def rough_noise(problem: Problem, rows: Sequence[int]) -> Float[np.ndarray, " channel"]:
-    """Reading noise from third differences, which a smooth motion hardly has."""
-    out = []
-    for j, known in enumerate(problem.noise):
-        columns = [r.readings[:n, j] for r, n in zip(problem.rows, rows, strict=True)]
-        joined = np.concatenate([np.diff(column, 3) ** 2 / 20 for column in columns])
-        spread = np.nanstd(np.concatenate(columns))
-        rough = np.sqrt(np.nanmedian(joined) / 0.455) if np.isfinite(joined).any() else spread
-        counts = np.concatenate([r.counts[:n, j] for r, n in zip(problem.rows, rows, strict=True)])
-        count = float(np.median(counts[counts > 0])) if counts.any() else 1.0
-        out.append(known if np.isfinite(known) else max(rough, 1e-6 * spread) * np.sqrt(count))
-    return np.array(out)
 
 
 def filtered_path(stepper: Stepper, rows: Sequence[int], r: int, z: np.ndarray, noise: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from ._along import along, force
 from ._build import build, equations_for, first_substep, rows_fitted
 from ._calibrate import grow
 from ._found import Found
-from ._missed import share_missed, variance_read
+from ._missed import share_missed, variances
 from ._options import Options
 from ._problem import Problem
 from ._start import beginning, first_fits, priors_without_effects, windows
@@ -178,7 +178,8 @@ def _is_as_strong(problem: Problem, found: Found) -> bool:
     path = max(paths, key=lambda one: one.log_evidence, default=None)
     if path is None or path.paths is None or not all(np.isfinite(one).all() for one in path.paths):
         return True
-    if (path.noise**2 > _FOLLOWED**2 * variance_read(problem)).any():
+    noise, shown = variances(problem)
+    if (path.noise**2 > noise + _FOLLOWED**2 * shown).any():
         return True
     assert found.priors.forces is not None  # effects were weighed
     own, d = problem.equations.momentum, problem.equations.declared  # what is unseen may come after it
