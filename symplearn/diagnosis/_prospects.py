@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from ._calibrate import Fits, estimate_noise, residuals, weights
 from ._exchange import Regression
@@ -64,6 +65,16 @@ class Prospects:
             return []
         grams = on_trajectory(w.stepper, fits, 0, w.rows)
         return scan(w.problem, grams, fits.z[0], combination, w.found.priors, self._grids(members))
+
+    def at_each(self, estimate: Estimate, units: Sequence[Unit]) -> list[Start]:
+        """Starts of an estimate's combination with one effect more, at every one of some places, about its trajectory
+        without what is missing beside it."""
+        w, c = self.weigher, estimate.combination
+        fits = self._about(c, estimate.z)
+        if fits is None:
+            return []
+        grams = on_trajectory(w.stepper, fits, 0, w.rows)
+        return [one for unit in units for one in scan(w.problem, grams, estimate.z, c, w.found.priors, [unit])]
 
     def _grids(self, members: Sequence[int]) -> list[Unit]:
         return [unit for m in members for unit in grid(self.weigher.problem, self.weigher.found.priors, m)]
@@ -127,18 +138,24 @@ class Prospects:
 
     def _fitted(self, combination: Combination) -> Fits | None:
         """A combination as it was fitted; None where it ran away."""
-        w, white = self.weigher, self.weigher.found.of(combination, "white")
+        white = self.weigher.found.of(combination, "white")
         assert white is not None
         if self._last is not None and self._last[0] == combination and self._last[1] is white:
             return self._last[2]
+        fits = self._about(combination, white.z)
+        if fits is not None:
+            self._last = combination, white, fits
+        return fits
+
+    def _about(self, combination: Combination, z: Float[np.ndarray, " z"]) -> Fits | None:
+        """Unknowns of a combination with what they leave of the readings; None where they run away."""
+        w = self.weigher
         weight = weights(w.problem, w.rows)
-        predictions = w.stepper.predict(white.z[None], [combination], w.rows)
+        predictions = w.stepper.predict(z[None], [combination], w.rows)
         noise = estimate_noise(w.problem, [combination], residuals(w.problem, predictions, weight), weight)
-        fits = Fits([combination], white.z[None], noise, predictions, np.zeros(1), np.ones(1, bool))
         if not np.isfinite(noise).all():
             return None
-        self._last = combination, white, fits
-        return fits
+        return Fits([combination], z[None], noise, predictions, np.zeros(1), np.ones(1, bool))
 
     def _units(self, most: int, sharp: Mapping[int, list[Unit]] | None = None) -> list[Unit]:
         """What is tried: every effect and target at its `sharp` places, or at all, thinned to so many at most."""

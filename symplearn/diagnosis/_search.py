@@ -325,7 +325,9 @@ class Search:
         alone = -np.inf if white is None else white.log_evidence + self.found.prices.log(self.base)
         if self.found.odds(best) > alone + _WORTH and self.in_time():
             self.progress("weighing forces that act for a while")
-            Spells(self.prospects, self.beginning.typical).weigh(best, _REACH)
+            spells = Spells(self.prospects, self.beginning.typical)
+            spells.weigh(best, _REACH)
+            spells.weigh_blows()
 
     def _weigh_with_outliers_in(self) -> None:
         if self.base:

@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from .._effects import IMPULSE
+from ._calibrate import calibrate
 from ._noisy import PathFit, fit_paths
 from ._outlook import Outlook
 from ._problem import Combination
 from ._prospects import Prospects
-from ._score import Start
+from ._score import Start, Unit
 from ._trajectory import Stepper
 from ._weighed import Estimate
 
@@ -23,6 +25,8 @@ _OVERLAP = 2
 _TRIED, _OWN, _PLACES, _WORTH = 4, 2, 60, 2.0
 # Steps after which a fit is given up, and how many nats it then lies behind the best of all with all that it promises.
 _STEPS, _HOPELESS = 4, 50.0
+# Blows that are tried in a spell, of all coordinates together, the steps of each, and how many are weighed then.
+_BLOWS, _BLOW_STEPS, _LIKELIEST = 48, 12, 4
 
 
 class Spells:
@@ -50,6 +54,36 @@ class Spells:
         ranked = [one.combination for one in likely if w.found.of(one.combination, "spell")]
         ranked.sort(key=w.found.odds, reverse=True)
         self._add([start for c in ranked[:_OWN] if (own := w.found.of(c, "spell")) for start in self._about(own)])
+
+    def weigh_blows(self) -> None:
+        """Blows within the force that acts for a while beside the best answer, where it is the likeliest remainder.
+
+        A blow is such a force, too, and its time has an optimum in every swing of what it sets going: a score about a
+        trajectory without it sees few of them.
+        """
+        w = self.weigher
+        best = max(w.found.estimates, key=w.found.odds)
+        spell = w.found.of(best, "spell")
+        others = [one.log_evidence for one in w.found.estimates[best] if one.kind != "spell"]
+        if spell is None or spell.log_evidence < max(others, default=-np.inf) + _WORTH or len(best) >= w.most:
+            return
+        if not (starts := self._struck(spell)):
+            return
+        z, combinations = np.stack([one.z for one in starts]), [one.combination for one in starts]
+        fits = calibrate(w.stepper, z, combinations, w.found.priors, w.rows, _BLOW_STEPS)
+        likeliest = np.argsort(np.where(np.isnan(fits.cost), np.inf, fits.cost))[:_LIKELIEST]
+        w.weigh([Start(combinations[k], fits.z[k], 0.0) for k in likeliest], whole=True)
+
+    def _struck(self, spell: Estimate) -> list[Start]:
+        """Its combination with a blow at times in it, on one coordinate or another."""
+        assert spell.exposures is not None  # it acts for a while
+        problem = self.weigher.problem
+        ((r, acting),) = [(r, np.flatnonzero(each)) for r, each in enumerate(spell.exposures) if each.any()]
+        blows = [c for c in problem.searched if problem.candidate(c).effect is IMPULSE]
+        some = acting[:: max(1, -(-len(acting) * len(blows) // _BLOWS))]
+        units = [Unit(c, float(problem.rows[r].times[k])) for c in blows for k in some]
+        starts, mine = self.prospects.at_each(spell, units), set(spell.combination)
+        return [one for one in starts if all(problem.members[m].recordings == (r,) for m in {*one.combination} - mine)]
 
     def _with_less(self, fits: list[PathFit]) -> list[PathFit]:
         """The best of some fits with a member less beside the same force, which may do what that was needed for."""
