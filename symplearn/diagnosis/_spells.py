@@ -79,7 +79,8 @@ class Spells:
         assert spell.exposures is not None  # it acts for a while
         problem = self.weigher.problem
         ((r, acting),) = [(r, np.flatnonzero(each)) for r, each in enumerate(spell.exposures) if each.any()]
-        blows = [c for c in problem.searched if problem.candidate(c).effect is IMPULSE]
+        beside = [c for c in problem.searched if problem.is_possible((*spell.combination, c))]
+        blows = [c for c in beside if problem.candidate(c).effect is IMPULSE]
         some = acting[:: max(1, -(-len(acting) * len(blows) // _BLOWS))]
         units = [Unit(c, float(problem.rows[r].times[k])) for c in blows for k in some]
         starts, mine = self.prospects.at_each(spell, units), set(spell.combination)
