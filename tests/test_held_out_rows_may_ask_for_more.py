@@ -7,6 +7,7 @@ import pytest
 from symplearn import diagnose
 from symplearn.diagnosis import Options
 from symplearn.diagnosis._build import Restriction
+from symplearn.report._html import html_report
 from symplearn.report._verdict import verdict_sentence
 
 TIMES, BLOW = 0.25 * np.arange(240), 50.1
@@ -38,6 +39,9 @@ def test_a_blow_in_held_out_rows_is_told_beside_the_answer():
     assert "impulse of q" in told
     assert "--holdout 0" in document["next_measurement"]
     assert "not with all of them" in verdict_sentence(found)
+    assert "in the fitted rows" in document["location"]["where"]
+    report = html_report(found)
+    assert "impulse on q" in report and "their noise leads one to expect" not in report
 
 
 def test_what_is_found_with_all_rows_fitted_is_what_was_told():

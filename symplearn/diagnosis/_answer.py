@@ -273,8 +273,9 @@ class Answer:
 
     def _location(self) -> dict[str, Any]:
         if self.verdict == "consistent":
+            rows = "in the fitted rows " if self.all_rows else ""
             return {"kind": "none", "targets": [], "recordings": [], "time_windows": [],
-                    "where": "nothing differs that the noise does not explain"}  # fmt: skip
+                    "where": f"{rows}nothing differs that the noise does not explain"}  # fmt: skip
         if self.chosen is None:
             return self._unexplained_location()
         combination = self.chosen.combination

@@ -28,6 +28,7 @@ def html_report(diagnosis: Diagnosis) -> str:
         verdict=verdict_sentence(diagnosis),
         problem=None if document["converged"] else PROBLEM,
         location=where_and_when(diagnosis),
+        held_back=_held_back(document["all_rows"]),
         findings=[_finding(finding, diagnosis) for finding in document["findings"]],
         equations=equation_pairs(diagnosis.equation_before, diagnosis.equation_after),
         plates=plates(diagnosis),
@@ -38,6 +39,12 @@ def html_report(diagnosis: Diagnosis) -> str:
         alternatives=_alternatives(document, len(diagnosis.series)),
         recordings=[f"{i}: {plain(series.name)}" for i, series in enumerate(diagnosis.series, 1)],
     )
+
+
+def _held_back(all_rows: Mapping[str, Any] | None) -> str:
+    """The likeliest of all rows, where that is not nothing."""
+    found = all_rows["likeliest"]["findings"] if all_rows else []
+    return combination(found) if found else "something without a name"
 
 
 def _template() -> jinja2.Template:
