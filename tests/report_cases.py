@@ -152,6 +152,7 @@ def document():
         },
         "next_measurement": "Release theta from a larger angle: quadratic drag outgrows viscous damping.",
         "warnings": [],
+        "all_rows": None,
         "thinning": {"rows": 800, "used": 800},
         "converged": True,
         "version": "0.1.0",
