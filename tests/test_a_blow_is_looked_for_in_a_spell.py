@@ -8,8 +8,7 @@ from symplearn.diagnosis._spells import Spells
 from symplearn.diagnosis._start import first_fits, priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
 
-# A spring of six radians a second is read for eleven seconds, and struck in its fifth swing; 19 swings more may take
-# a blow of one sign or the other, so that its time has an optimum in every one of them.
+# A spring of six radians a second is read for ten swings and a half, and struck in its fifth.
 TIMES, BLOW, FREQUENCY = np.linspace(0.0, 11.0, 221), 5.03, 6.0
 
 
@@ -34,8 +33,10 @@ def begun(size):
 
 
 def test_the_blow_is_found_where_it_was():
-    """A blow of 1.2, that turns the motion's energy by a third, is found at its time, and is likelier than a force for
-    a while."""
+    """A blow of 1.2, a fifth of the largest momentum, is found at its time, and is likelier than a force for a while.
+
+    Seen: off by less than 0.01 in time and 0.01 in size; a row comes every 0.05, and the noise leaves the size open by
+    some hundredths."""
     search, spells = begun(1.2)
     assert not any(search.problem.candidate(m).effect.name == "impulse" for c in search.found.estimates for m in c)
     spells.weigh_blows()

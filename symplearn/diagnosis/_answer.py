@@ -28,7 +28,7 @@ from ._locate import (
     where_sentence,
     whole_windows,
 )
-from ._next import ALL_ROWS, NOTHING_SHOWN, all_rows, next_measurement
+from ._next import ASK_AGAIN, NOTHING_SHOWN, all_rows, next_measurement
 from ._options import Options
 from ._outlook import Outlook, intensity_of
 from ._problem import Combination, Problem
@@ -186,7 +186,7 @@ class Answer:
         if p.is_constant:
             return NOTHING_SHOWN
         if self.all_rows is not None:
-            return ALL_ROWS
+            return ASK_AGAIN
         top = max((w.probability for w in p.named), default=0.0)
         rivals = [[one.key for m in w.combination for one in self.problem.candidate(m).told()]
                   for w in p.named if w.probability > max(0.02, 0.1 * top)][:6]  # fmt: skip

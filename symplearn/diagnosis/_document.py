@@ -132,6 +132,7 @@ def alternatives(
 
 
 def alternative(problem: Problem, combination, unexplained: bool, probability: float) -> dict[str, Any]:
+    """What else it could be: effects, or none of them, as a row of the document."""
     found = [one for member in combination for one in problem.candidate(member).told()]
     return {
         "findings": [{"effect": one.effect.name, "target": one.target} for one in found],

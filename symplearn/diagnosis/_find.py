@@ -48,8 +48,8 @@ def searched(
     file: SimulationFile, recordings: Sequence[Recording], options: Options, deadline: float
 ) -> tuple[Found, Stepper, list[str], dict[str, Any] | None]:
     """Lay the problem out with substeps that are fine enough, and search; once more where what is found needs finer,
-    or shows readings to be of another time, which is told in sentences, as other units are. At last what
-    all rows say, the held-out ones too, where that is another answer.
+    or shows readings to be of another time, which is told in sentences, as other units are. At last what all
+    rows say, the held-out ones too, where that is another answer.
 
     `InputError` where there is nothing to fit, to search or to step.
     """

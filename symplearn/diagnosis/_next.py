@@ -9,7 +9,7 @@ _Key = tuple[str, tuple[str, ...]]  # effect and targets
 _Keys = frozenset[_Key]
 
 NOTHING_SHOWN = "one in which the simulated motion is seen: larger than the noise, and for longer than it takes to turn"
-ALL_ROWS = "nothing before these rows are asked again with --holdout 0: the held-out ones hold what the others do not"
+ASK_AGAIN = "nothing before these rows are asked again with --holdout 0: the held-out ones hold what the others do not"
 _ANOTHER = "a recording at another amplitude, to test the law outside the range it was found in"
 _HARDER = "none is needed; a longer recording at another amplitude would test the simulation harder"
 _CLOSER = "more channels and a faster sampling where the strain is largest, to see what acts there"

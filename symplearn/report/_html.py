@@ -20,7 +20,7 @@ from ._words import DASH, combination, effect, estimate, interval, number, plain
 def html_report(diagnosis: Diagnosis) -> str:
     """The text of `report.html`: pictures and style inside, no script; all text of files is escaped."""
     document = diagnosis.document
-    changed = document["verdict"] != "consistent"
+    changed, all_rows = document["verdict"] != "consistent", document["all_rows"]
     return _template().render(
         title=diagnosis.title or "Diagnosis",
         document=document,
@@ -28,7 +28,7 @@ def html_report(diagnosis: Diagnosis) -> str:
         verdict=verdict_sentence(diagnosis),
         problem=None if document["converged"] else PROBLEM,
         location=where_and_when(diagnosis),
-        held_back=_held_back(document["all_rows"]),
+        held_back=combination(all_rows["likeliest"]["findings"], unexplained=True) if all_rows else None,
         findings=[_finding(finding, diagnosis) for finding in document["findings"]],
         equations=equation_pairs(diagnosis.equation_before, diagnosis.equation_after),
         plates=plates(diagnosis),
@@ -39,12 +39,6 @@ def html_report(diagnosis: Diagnosis) -> str:
         alternatives=_alternatives(document, len(diagnosis.series)),
         recordings=[f"{i}: {plain(series.name)}" for i, series in enumerate(diagnosis.series, 1)],
     )
-
-
-def _held_back(all_rows: Mapping[str, Any] | None) -> str:
-    """The likeliest of all rows, where that is not nothing."""
-    found = all_rows["likeliest"]["findings"] if all_rows else []
-    return combination(found) if found else "something without a name"
 
 
 def _template() -> jinja2.Template:
