@@ -1,8 +1,9 @@
 """What a self-excitation feeds in, against what is lost beside it.
 
 Beside a friction, or far inside the motion, a self-excitation is one more law of damping: the two cancel but for what
-the law of friction lacks. That something drives the motion is seen only where more is fed in than is lost, by frictions
-that are found and by those that the simulation has.
+the law of friction lacks. That something drives the motion is seen only where more is fed in than is lost by the
+frictions that are found. One that takes back a part of what the simulation loses, without outdoing that, is less to be
+expected.
 """
 
 from collections.abc import Sequence
@@ -18,6 +19,8 @@ from ._problem import Combination, Problem
 
 # Stretches of every recording, each of a swing at least.
 _STRETCHES = 12
+# Prior probability that what drives only takes back a part of what the simulation loses.
+_TAKEN_BACK = 0.1
 # The log of a probability that is as good as none.
 _NEVER = -1e4
 
@@ -71,8 +74,9 @@ def log_fed(
     problem: Problem, combination: Combination, by: Powers | None, z: Float[np.ndarray, " z"],
     covariance: Float[np.ndarray, "z z"],
 ) -> float:  # fmt: skip
-    """Log probability that every self-excitation of a combination feeds in more than it and the frictions of its
-    coordinate, known and found, take out, somewhere in the recordings; zero without any."""
+    """Log probability that every self-excitation of a combination feeds in more than it and the frictions found on its
+    coordinate take out, somewhere in the recordings, and than the simulation loses there; that of `_TAKEN_BACK` where
+    it does not outdo the latter. Zero without any."""
     ones = [m for m in combination if problem.candidate(m).effect is EXCITATION]
     return 0.0 if by is None else float(sum(_log_fed(problem, combination, m, by, z, covariance) for m in ones))
 
@@ -90,10 +94,13 @@ def _log_fed(problem: Problem, combination: Combination, member: int, by: Powers
     some = np.isin(by.recordings, own.recordings)
     fed, known = fed[some], by.known[some, own.candidate.place]
     with np.errstate(all="ignore"):  # what ran away says nothing
-        sd = np.sqrt(np.maximum(np.einsum("wi,ij,wj->w", fed, covariance, fed), 0.0))
-        surplus = (fed @ z + known) / np.maximum(sd, 1e-300)
-    surplus = surplus[np.isfinite(surplus)]
-    return max(float(log_ndtr(surplus.max())), _NEVER) if len(surplus) else 0.0
+        sd = np.maximum(np.sqrt(np.maximum(np.einsum("wi,ij,wj->w", fed, covariance, fed), 0.0)), 1e-300)
+        surplus = (np.stack([fed @ z + known, fed @ z]) / sd).T
+    surplus = surplus[np.isfinite(surplus).all(1)]
+    if not len(surplus):
+        return 0.0
+    drives, takes_back = np.maximum(log_ndtr(surplus.max(0)), _NEVER)
+    return float(max(drives, np.log(_TAKEN_BACK) + takes_back))
 
 
 def _is_met(own: Candidate, other: Candidate) -> bool:
