@@ -197,7 +197,7 @@ class Simulated(eqx.Module):
         self.values = taken_apart(equations, self.coefficients)
 
     def at(
-        self, t: Float[Array, ""] | float, inputs: Float[Array, " known"], width: Float[Array, ""] | float = 1e-9
+        self, t: Float[Array, ""] | float, inputs: Float[Array, " known"], width: Float[Array, ""] | float = 0.0
     ) -> SimulatedHamiltonian:
         """The system with all that depends on time as it stands at one time; `width` as in `moment`. What is known of
         the time before the inputs is of no account."""
@@ -208,13 +208,15 @@ class Simulated(eqx.Module):
     def moment(self, t: Float[Array, ""], width: Float[Array, ""] | float) -> Moment:
         """What depends on time alone.
 
-        `width` is the time over which a sudden change of a parameter is spread, so that its time has a derivative.
+        `width` is the time over which a sudden change of a parameter is spread, so that its time has a derivative. At
+        an instant, of which a reading is, it has come or not: spread over however little, a fit would find the time at
+        which a single reading has just the share of the change that it asks for.
         """
         of = lambda effect, k=0: self.values[effect.name, None][k]  # noqa: E731
 
         def changed(factor: Array) -> Array:
-            wide = jnp.where(jnp.asarray(width) > 0, width, 1.0)  # rows that only fill up have none
-            after = jnp.clip((t - of(REGIME, 1)) / wide + 0.5, 0.0, 1.0)
+            lasts, since = jnp.asarray(width) > 0, t - of(REGIME, 1)
+            after = jnp.where(lasts, jnp.clip(since / jnp.where(lasts, width, 1.0) + 0.5, 0.0, 1.0), since >= 0)
             return factor * (1 + self._oscillation(MODULATION, t)) * (1 + of(REGIME) * after)
 
         factor = (1 + of(ERROR)) * (1 + of(DRIFTING) * (t - self.equations.start - of(DRIFTING, 1)))

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import sympy
 from augmented_cases import (
     CURVED,
     CURVED_PAIR,
@@ -16,7 +17,12 @@ from augmented_cases import (
     START,
     TAO,
     A,
+    K,
+    M,
+    P,
+    Q,
     by_hand,
+    candidate,
     curved,
     curved_pair,
     flat_pair,
@@ -28,8 +34,10 @@ from augmented_cases import (
 )  # fmt: skip
 from engine_cases import solved
 
+from symplearn._augmented import equations
 from symplearn._augmented_flow import SimulatedReading
 from symplearn._effects import EFFECTS
+from symplearn._terms import Mechanics
 
 # Effect, side, the contract's coefficients, and the force of (t, q, v) by hand.
 FORCES = [
@@ -187,6 +195,22 @@ def test_sensors_compose_as_the_contract_says():
     # Two steps of 0.05 of a method of order four: 1e-7 times fifth derivatives of some tens over hundreds.
     np.testing.assert_allclose(found, expected, atol=1e-6)
     assert np.abs(earlier - states)[:, 1].max() > 0.02
+
+
+def test_a_change_has_come_at_a_reading_or_not():
+    """A pull that is read and stiffens at t = 1.2: it has from the row of that very time on, a hair later it has not,
+    and nowhere does one row's reading go with the time of the change, by which a fit would give it what it asks for."""
+    known = Mechanics([Q], [P], P**2 / (2 * M) + K * Q**2 / 2, [sympy.Integer(0)], {"pull": K * Q}, start=0.0)
+    built = equations(known, (M, K), ())
+    place = candidate(built, "regime_change", "a").values.stop - 1
+
+    def pull(t_star, t):
+        on = jnp.asarray(vector(built, "regime_change", {"d": 0.5, "t_star": 1.2}, "a")).at[place].set(t_star)
+        return SimulatedReading(built, jnp.array([MASS, A]), on)(jnp.asarray(widened([0.3, 0.0])), (t, jnp.zeros(0)))[0]
+
+    for t_star, factor in ((1.2, 1.5), (1.2 + 1e-12, 1.0), (1.1, 1.5), (1.3, 1.0)):
+        value, slope = jax.jvp(lambda t_star: pull(t_star, jnp.asarray(1.2)), (t_star,), (1.0,))
+        assert value == pytest.approx(factor * A * 0.3, rel=1e-12) and slope == 0.0
 
 
 def test_a_delay_is_of_order_four():
