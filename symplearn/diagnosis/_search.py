@@ -11,6 +11,7 @@ from .._effects import COORDINATE, NOISE, OUTLIERS, PAIR
 from ._beginning import STARTS, Beginning
 from ._calibrate import Priors
 from ._clocks import share_clocks
+from ._far_off import weigh_without_far
 from ._found import Found
 from ._larger import Larger
 from ._noisy import fit_paths
@@ -108,6 +109,7 @@ class Search:
         self._weigh_forces()
         self._weigh_spells()
         self._weigh_with_outliers_in()
+        self._weigh_with_outliers_out()
         return self.found
 
     def along(self, members: Sequence[int]) -> list[Start]:
@@ -333,6 +335,13 @@ class Search:
         if self.base:
             self.progress("weighing the best combinations with every reading")
         self.weigher.weigh_with_outliers_in()
+
+    def _weigh_with_outliers_out(self) -> None:
+        """Where readings were left in since they were no outliers of the motion then known: those that are of this."""
+        if self.beginning.spared and not self.base and self.in_time():
+            self.progress("weighing the best combinations without what lies far off")
+            if weigh_without_far(self.weigher, self.beginning.spared):
+                self.beginning.paths = [replace(path, combination=self.base) for path in self.beginning.paths]
 
     def add_forces(self, combinations: Sequence[Combination], every: int) -> None:
         starts = []

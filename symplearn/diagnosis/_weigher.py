@@ -255,6 +255,24 @@ class Weigher:
         value = self._owed(self.base, errors, flagged, fits.noise[lane], np.concatenate(weight))
         return value, tuple((share, size * float(s)) for (share, size), s in zip(told, fits.noise[lane], strict=True))
 
+    def leave_out(
+        self, far: Sequence[np.ndarray], errors: Sequence[np.ndarray], members: Combination, fit: Fits
+    ) -> None:
+        """Leave out readings that lie far off the first of some fits, by `errors` in its noise; every combination then
+        holds the outliers `members`."""
+        self.flagged = [np.zeros_like(r.readings, bool) for r in self.plain.problem.rows]
+        for flagged, bad in zip(self.flagged, far, strict=True):
+            flagged[: len(bad)] = bad
+        weight = np.concatenate(weights(self.plain.problem, self.rows))
+        self.base = members
+        self.owed_along = self._owed(members, np.concatenate(errors), np.concatenate(far), fit.noise[0], weight)
+        self.stepper = self.plain.on(self.plain.problem.without(self.flagged))
+
+    def leave_in(self) -> None:
+        """Leave all readings in."""
+        self.stepper, self.base, self.owed_along = self.plain, (), 0.0
+        self.flagged = [np.zeros_like(flagged) for flagged in self.flagged]
+
     def weigh_with_outliers_in(self) -> None:
         """The best combinations again with no reading taken out."""
         if not self.base:

@@ -1,0 +1,63 @@
+"""Readings that lie far off the likeliest answer, where they had been left in as no outliers of another motion.
+
+A motion that a search cannot follow yet has its outliers in other places. Once these turn out to be none, all readings
+of their sensors are left in; the answer that is then found may have outliers of its own.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from .._effects import NOISE, OUTLIERS
+from ._calibrate import Fits, residuals, weights
+from ._found import doubtful_outliers, speaker
+from ._problem import USUAL, Combination
+from ._scatter import suspects
+from ._score import Start
+from ._weigher import KEPT, Weigher
+
+
+def weigh_without_far(weigher: Weigher, spared: frozenset[int]) -> bool:
+    """The best combinations again without the readings of some columns that lie far off the very best of them, and
+    whether one with these outliers is the likeliest: if so, they stay left out."""
+    problem, found = weigher.plain.problem, weigher.found
+    columns = {problem.candidate(m).place: m for m in problem.searched if problem.candidate(m).effect is OUTLIERS}
+    columns = {j: m for j, m in columns.items() if j in spared}
+    ranked = [c for c in sorted(found.estimates, key=found.odds, reverse=True) if found.of(c, "white")]
+    fit = weigher.as_fitted(ranked[:1])
+    errors = _errors(weigher, fit)
+    far = [bad & np.isin(np.arange(problem.channels), list(columns)) for bad in suspects(errors)]
+    members = tuple(sorted(m for j, m in columns.items() if any(bad[:, j].any() for bad in far)))[: USUAL - 1]
+    if not members:
+        return False
+    starts = _starts(weigher, [(), *ranked[:KEPT]], columns, members)
+    weigher.leave_out(far, errors, members, fit)
+    weigher.weigh(starts, whole=True)
+    best = speaker(found.estimates[max(found.estimates, key=found.odds)])
+    if doubtful_outliers(problem, members, best):
+        weigher.leave_in()
+    return bool(weigher.base)
+
+
+def _errors(weigher: Weigher, fit: Fits) -> list[Float[np.ndarray, "_ channel"]]:
+    """Errors of the first of some fits in units of its noise, by recording; NaN where nothing was read."""
+    problem = weigher.plain.problem
+    weight = weights(problem, weigher.rows)
+    shown = residuals(problem, fit.predictions, weight)
+    return [np.where(w > 0, np.sqrt(w) * x[0] / fit.noise[0], np.nan) for w, x in zip(weight, shown, strict=True)]
+
+
+def _starts(
+    weigher: Weigher, combinations: Sequence[Combination], columns: Mapping[int, int], members: Combination
+) -> list[Start]:
+    """Where combinations were found, with outliers in place of a larger noise of their columns."""
+    problem, starts = weigher.plain.problem, dict[Combination, Start]()
+    for combination in combinations:
+        white = weigher.found.of(combination, "white")
+        ones = [(m, problem.candidate(m)) for m in combination]
+        rest = [m for m, one in ones if one.effect is not NOISE or one.place not in columns]
+        some = tuple(sorted({*rest, *members}))
+        if white is not None and len(some) <= weigher.most:
+            starts.setdefault(some, Start(some, white.z, 0.0))
+    return list(starts.values())
