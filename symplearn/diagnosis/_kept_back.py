@@ -24,7 +24,7 @@ def promises_more(stepper: Stepper, found: Found) -> bool:
     assert white is not None  # the simulation as it is is weighed first
     weigher.weigh([Start((), white.z, 0.0)], whole=True)
     starts = Prospects(weigher).about((), MANY)
-    return max((one.gain + found.prices.log(one.combination) for one in starts), default=-np.inf) > 0.0
+    return bool(max((one.gain + found.prices.log(one.combination) for one in starts), default=-np.inf) > 0.0)
 
 
 def of_all_rows(stepper: Stepper, found: Found) -> dict[str, Any] | None:
