@@ -20,7 +20,7 @@ def prepare(cache: bool) -> None:
     # again took a twentieth of a diagnosis.
     gc.freeze()
     gc.set_threshold(*_COLLECTED)
-    atexit.register(gc.freeze)  # else all that stayed is looked through once more, which took half a second
+    atexit.register(gc.freeze)  # else all that stayed is looked through once more: 0.35 s of the demo
     jax.config.update("jax_enable_x64", True)
     if not os.environ.get("JAX_PLATFORMS"):
         # A diagnosis is machine code and small arrays, for each of which a graphics card has to be called.

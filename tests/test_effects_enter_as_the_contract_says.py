@@ -210,6 +210,7 @@ def test_a_change_has_come_at_a_reading_or_not():
 
     for t_star, factor in ((1.2, 1.5), (1.2 + 1e-12, 1.0), (1.1, 1.5), (1.3, 1.0)):
         value, slope = jax.jvp(lambda t_star: pull(t_star, jnp.asarray(1.2)), (t_star,), (1.0,))
+        # Two products in double precision: 1e-12 is some thousands of their round-off.
         assert value == pytest.approx(factor * A * 0.3, rel=1e-12) and slope == 0.0
 
 

@@ -87,7 +87,7 @@ def test_rows_that_average_many_readings_owe_no_more():
         many = replace(p, rows=(replace(p.rows[0], counts=count * p.rows[0].counts),))
         (weight,) = weights(many, [len(TIMES)])
         w = Weigher(Stepper(many), Found(many, priors_without_effects(many)))
-        found.append(w._owed((member,), errors, out, np.full(1, NOISE * np.sqrt(weight[0, 0])), weight))
+        found.append(w.owed_for((member,), errors, out, np.full(1, NOISE * np.sqrt(weight[0, 0])), weight))
     np.testing.assert_allclose(found, found[0], rtol=1e-12)
 
 

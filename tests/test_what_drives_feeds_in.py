@@ -111,7 +111,8 @@ def test_what_the_simulation_loses_counts(more):
     for values, owed in (([0.1, 0.0], -np.log(10.0)), ([0.5, 0.0], 0.0)):
         c, z = combined(p, {"self_excitation": values})
         found = log_fed(p, c, priors.powers, z, np.diag(np.full(p.size, 1e-6) ** 2))
-        # 1e-6: the log of a probability of one, of a surplus of hundreds of standard deviations.
+        # What is owed is exact but for the log of the probability that a surplus of hundreds of standard deviations is
+        # one, which is nothing: 1e-6 is ample.
         assert found == pytest.approx(owed, abs=1e-6)
     c, z = combined(p, {"self_excitation": [0.0001, 0.5]})
     assert log_fed(p, c, priors.powers, z, np.diag(np.full(p.size, 1e-6) ** 2)) < -100

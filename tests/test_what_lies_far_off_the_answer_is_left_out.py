@@ -5,21 +5,33 @@ import numpy as np
 import pytest
 
 from symplearn.diagnosis import _far_off
+from symplearn.diagnosis._build import Restriction, augmented_equations, build
 from symplearn.diagnosis._far_off import weigh_without_far
 from symplearn.diagnosis._score import Start
+from symplearn.diagnosis._search import Search
+from symplearn.diagnosis._start import first_fits, priors_without_effects
+from symplearn.diagnosis._trajectory import Stepper
 
 TIMES = np.linspace(0.0, 30.0, 150)
 FAR = [12, 40, 77, 101, 133]
 
 
-def weighed(far):
-    """A damped swing with some readings far off, and what a weigher found with all of them in: nothing, the damping,
-    and a larger noise beside it."""
+SOME = Restriction(("viscous_damping", "sensor_noise", "sensor_outliers"))
+
+
+def read(far):
+    """A damped swing with some readings far off, and the problem of a simulation without damping."""
     swing = cases.solved(lambda t, x: [x[1], -x[0] - 0.08 * x[1]], [1.0, 0.0], TIMES)
     readings = swing[:, 0] + 0.01 * np.random.default_rng(1).normal(size=len(TIMES))
     readings[far] += 0.3 * np.array([1, -1, 1, 1, -1])[: len(far)]
     file = cases.simulation("p**2/2 + q**2/2", more="[recording.noise]\ny = 0.01")
-    p = cases.problem(file, [cases.recorded(TIMES, readings)], 0.1)
+    recording = cases.recorded(TIMES, readings)
+    return swing, build(file, augmented_equations(file), [recording], 0.0, 0.1, SOME)
+
+
+def weighed(far):
+    """What a weigher found with all readings in: nothing, the damping, and a larger noise beside it."""
+    swing, p = read(far)
     weigher = cases.weigher(p, swing[:, 0], swing[:, 1])
     names = {p.candidate(m).effect.name: m for m in p.searched}
     damping, noise = names["viscous_damping"], names["sensor_noise"]
@@ -52,6 +64,20 @@ def test_those_far_off_the_answer_are_left_out(outlying):
     assert set(best) == set(expected) and weigher.base == expected[1:]
     one, (place,) = weigher.found.of(best, "white"), [p for m, p in weigher.problem.placed(best) if m == expected[0]]
     assert abs(one.z[place.start] - 0.08) < 3 * np.sqrt(one.covariance[place.start, place.start])
+
+
+@pytest.mark.parametrize(("spared", "asked"), [(frozenset({0}), True), (frozenset(), False)], ids=["left in", "not"])
+def test_a_search_that_leaves_readings_in_asks_again(spared, asked):
+    """Whether they were taken out at the beginning or at last, the damping is told with the same five outliers."""
+    _, p = read(FAR)
+    stepper, said = Stepper(p), []
+    seeds = first_fits(stepper, priors_without_effects(p), [r.fitted for r in p.rows])
+    search = Search(stepper, seeds.z, np.inf, said.append, spared)
+    found = search.run()
+    assert ("weighing the best combinations without what lies far off" in said) == asked
+    best = max(found.estimates, key=found.odds)
+    assert {p.candidate(m).effect.name for m in best} == {"viscous_damping", "sensor_outliers"}
+    assert np.nonzero(search.weigher.flagged[0][:, 0])[0].tolist() == FAR
 
 
 def test_where_they_turn_out_to_be_none_all_stay_in_again(monkeypatch):

@@ -19,7 +19,7 @@ from ._problem import Combination, Problem
 
 # Stretches of every recording, each of a swing at least.
 _STRETCHES = 12
-# Prior probability that what drives only takes back a part of what the simulation loses.
+# Prior probability, a guess, that what drives only takes back a part of what the simulation loses.
 _TAKEN_BACK = 0.1
 # The log of a probability that is as good as none.
 _NEVER = -1e4

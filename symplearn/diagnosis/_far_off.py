@@ -7,14 +7,14 @@ of their sensors are left in; the answer that is then found may have outliers of
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float
 
-from .._effects import NOISE, OUTLIERS
-from ._calibrate import Fits, residuals, weights
+from .._effects import NOISE
+from ._calibrate import residuals, weights
 from ._found import doubtful_outliers, speaker
 from ._problem import USUAL, Combination
 from ._scatter import suspects
 from ._score import Start
+from ._weighed import standardised
 from ._weigher import KEPT, Weigher
 
 
@@ -22,30 +22,23 @@ def weigh_without_far(weigher: Weigher, spared: frozenset[int]) -> bool:
     """The best combinations again without the readings of some columns that lie far off the very best of them, and
     whether one with these outliers is the likeliest: if so, they stay left out."""
     problem, found = weigher.plain.problem, weigher.found
-    columns = {problem.candidate(m).place: m for m in problem.searched if problem.candidate(m).effect is OUTLIERS}
-    columns = {j: m for j, m in columns.items() if j in spared}
+    columns = {j: m for j, m in weigher.outlier_columns.items() if j in spared}
     ranked = [c for c in sorted(found.estimates, key=found.odds, reverse=True) if found.of(c, "white")]
-    fit = weigher.as_fitted(ranked[:1])
-    errors = _errors(weigher, fit)
-    far = [bad & np.isin(np.arange(problem.channels), list(columns)) for bad in suspects(errors)]
+    fit, weight = weigher.as_fitted(ranked[:1]), weights(problem, weigher.rows)
+    errors = standardised([x[0] for x in residuals(problem, fit.predictions, weight)], weight, fit.noise[0])
+    parts = suspects(np.split(errors, np.cumsum(weigher.rows)[:-1]))
+    far = [bad & np.isin(np.arange(problem.channels), list(columns)) for bad in parts]
     members = tuple(sorted(m for j, m in columns.items() if any(bad[:, j].any() for bad in far)))[: USUAL - 1]
     if not members:
         return False
     starts = _starts(weigher, [(), *ranked[:KEPT]], columns, members)
-    weigher.leave_out(far, errors, members, fit)
+    owed = weigher.owed_for(members, errors, np.concatenate(far), fit.noise[0], np.concatenate(weight))
+    weigher.leave_out(far, members, owed)
     weigher.weigh(starts, whole=True)
     best = speaker(found.estimates[max(found.estimates, key=found.odds)])
     if doubtful_outliers(problem, members, best):
-        weigher.leave_in()
+        weigher.leave_out([np.zeros_like(bad) for bad in far], (), 0.0)
     return bool(weigher.base)
-
-
-def _errors(weigher: Weigher, fit: Fits) -> list[Float[np.ndarray, "_ channel"]]:
-    """Errors of the first of some fits in units of its noise, by recording; NaN where nothing was read."""
-    problem = weigher.plain.problem
-    weight = weights(problem, weigher.rows)
-    shown = residuals(problem, fit.predictions, weight)
-    return [np.where(w > 0, np.sqrt(w) * x[0] / fit.noise[0], np.nan) for w, x in zip(weight, shown, strict=True)]
 
 
 def _starts(

@@ -78,7 +78,7 @@ class Weigher:
         Every path loses its own: one that a strong missing force may bend goes through outliers and shows few.
         """
         problem = self.plain.problem
-        columns = {problem.candidate(m).place: m for m in problem.searched if problem.candidate(m).effect is OUTLIERS}
+        columns = self.outlier_columns
         able = (columns.keys() | set(problem.known_outliers)) - spared
         may = np.array([j in able for j in range(problem.channels)])
         lanes = [fit for fit in fits if np.isfinite(fit.log_evidence)]
@@ -91,12 +91,10 @@ class Weigher:
             lanes = [replace(fit, left_out=masks, laplace=None) for fit, masks in zip(lanes, far, strict=True)]
             lanes = fit_paths(self.plain, lanes, priors, self.rows, self.path_steps)
         best = max(lanes, key=self._with_outliers)
-        for r, bad in enumerate(best.left_out or ()):
-            self.flagged[r][: len(bad)] = bad
-        some = np.any([bad.any(0) for bad in self.flagged], axis=0)
-        self.stepper = self.plain.on(problem.without(self.flagged)) if some.any() else self.plain
-        self.base = tuple(sorted(m for j, m in columns.items() if some[j]))[: USUAL - 1]
-        self.owed_along = self._path_owed(best, self.base) if self.base else 0.0
+        assert best.left_out is not None  # so it is asked
+        some = np.any([bad.any(0) for bad in best.left_out], axis=0)
+        members = tuple(sorted(m for j, m in columns.items() if some[j]))[: USUAL - 1]
+        self.leave_out(best.left_out, members, self._path_owed(best, members) if members else 0.0)
         return bool(some.any())
 
     def _far(self, fit: PathFit, may: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -122,9 +120,9 @@ class Weigher:
         rest = np.sqrt((np.where(used, errors, 0.0) ** 2).sum(0) / np.maximum(used.sum(0), 1))
         less = np.isnan(self.problem.noise) & (rest > 0) & (rest < 1)
         weight = np.concatenate(weights(self.plain.problem, self.rows))
-        return self._owed(members, errors / np.where(less, rest, 1.0), flagged, fit.noise, weight)
+        return self.owed_for(members, errors / np.where(less, rest, 1.0), flagged, fit.noise, weight)
 
-    def _owed(
+    def owed_for(
         self, members: Combination, errors: np.ndarray, flagged: np.ndarray, noise: np.ndarray, weight: np.ndarray
     ) -> float:
         """Log evidence of the readings that were taken out, as a density in their own unit; one that averages several
@@ -252,26 +250,24 @@ class Weigher:
         errors = standardised([x[lane] for x in r], weight, fits.noise[lane])
         flagged = np.concatenate([bad[:n] for bad, n in zip(self.flagged, self.rows, strict=True)])
         told = [outliers(errors[:, j], flagged[:, j]) for j in range(self.problem.channels)]
-        value = self._owed(self.base, errors, flagged, fits.noise[lane], np.concatenate(weight))
+        value = self.owed_for(self.base, errors, flagged, fits.noise[lane], np.concatenate(weight))
         return value, tuple((share, size * float(s)) for (share, size), s in zip(told, fits.noise[lane], strict=True))
 
-    def leave_out(
-        self, far: Sequence[np.ndarray], errors: Sequence[np.ndarray], members: Combination, fit: Fits
-    ) -> None:
-        """Leave out readings that lie far off the first of some fits, by `errors` in its noise; every combination then
-        holds the outliers `members`."""
+    @property
+    def outlier_columns(self) -> dict[int, int]:
+        """The outliers that may be told of each column."""
+        problem = self.plain.problem
+        return {problem.candidate(m).place: m for m in problem.searched if problem.candidate(m).effect is OUTLIERS}
+
+    def leave_out(self, far: Sequence[np.ndarray], members: Combination, owed_along: float) -> None:
+        """Leave out these readings, by recording, and no others; every combination then holds the outliers `members`,
+        which owe at most `owed_along` beside errors that are not those of a white fit."""
         self.flagged = [np.zeros_like(r.readings, bool) for r in self.plain.problem.rows]
         for flagged, bad in zip(self.flagged, far, strict=True):
             flagged[: len(bad)] = bad
-        weight = np.concatenate(weights(self.plain.problem, self.rows))
-        self.base = members
-        self.owed_along = self._owed(members, np.concatenate(errors), np.concatenate(far), fit.noise[0], weight)
-        self.stepper = self.plain.on(self.plain.problem.without(self.flagged))
-
-    def leave_in(self) -> None:
-        """Leave all readings in."""
-        self.stepper, self.base, self.owed_along = self.plain, (), 0.0
-        self.flagged = [np.zeros_like(flagged) for flagged in self.flagged]
+        some = any(bad.any() for bad in far)
+        self.stepper = self.plain.on(self.plain.problem.without(self.flagged)) if some else self.plain
+        self.base, self.owed_along = members, owed_along
 
     def weigh_with_outliers_in(self) -> None:
         """The best combinations again with no reading taken out."""
