@@ -2,6 +2,7 @@
 
 import engine_cases as cases
 import numpy as np
+import pytest
 from posterior_cases import estimate, made
 
 from symplearn.diagnosis import Options, diagnose, restriction_of
@@ -27,6 +28,7 @@ def told(rates, bias):
     return diagnose(file, [recording], options), " ".join(said)
 
 
+@pytest.mark.slow
 def test_four_effects_are_told_where_three_leave_more():
     """A spring that is damped, uneven, hardens, and is read off its zero: all four, with their sizes, and the later
     rows are missed by their noise."""

@@ -44,6 +44,7 @@ PENDULUM = cases.simulation("p**2/2 - 20*cos(q)")
 BALL = cases.simulation("(px**2 + py**2)/2 + 9.81*y", ("x", "y"), ("px", "py"), {"a": "x", "b": "y"})
 
 
+@pytest.mark.slow
 def test_degrees_for_radians_are_told():
     """A pendulum read in degrees, whose simulation has radians, is told to be that, first of all warnings."""
     warnings, _ = asked(PENDULUM, TIMES, np.degrees(swing()))

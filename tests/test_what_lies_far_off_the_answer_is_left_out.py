@@ -66,7 +66,10 @@ def test_those_far_off_the_answer_are_left_out(outlying):
     assert abs(one.z[place.start] - 0.08) < 3 * np.sqrt(one.covariance[place.start, place.start])
 
 
-@pytest.mark.parametrize(("spared", "asked"), [(frozenset({0}), True), (frozenset(), False)], ids=["left in", "not"])
+@pytest.mark.parametrize(
+    ("spared", "asked"), [(frozenset({0}), True), pytest.param(frozenset(), False, marks=pytest.mark.slow)],
+    ids=["left in", "not"],
+)  # fmt: skip
 def test_a_search_that_leaves_readings_in_asks_again(spared, asked):
     """Whether they were taken out at the beginning or at last, the damping is told with the same five outliers."""
     _, p = read(FAR)

@@ -106,6 +106,7 @@ def test_a_start_that_is_right_is_agreement():
     assert not any("constants" in one for one in document["warnings"])
 
 
+@pytest.mark.slow
 def test_a_sensor_the_wrong_way_round_is_found():
     """A scale of -1 is no dead sensor: the gain is -2 to within its interval, and said as an opposite sign."""
     file, (recording,) = pendulum(1.2)
