@@ -47,7 +47,8 @@ gallery: $(VENV)/project.stamp ## the pages of docs/gallery, from the real recor
 	$(PYTHON) -m experiments.gallery
 
 # Two stamps: a new lock makes the environment anew, a new pyproject.toml only installs the project again.
-# A stamp is the last thing written, so an interrupted run starts over.
+# A stamp is the last thing written, so an interrupted run starts over. What is edited in place is compiled here, as pip
+# does with everything else: where Python is told to write no bytecode, every start would compile it all again.
 $(VENV)/lock.stamp: $(LOCK)
 	@python=; for candidate in python3.12 python3.11 python3 python3.13; do \
 	    if "$$candidate" -c '$(USABLE)' >/dev/null 2>&1; then python=$$candidate; break; fi; \
@@ -66,6 +67,7 @@ USABLE = import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))
 
 $(VENV)/project.stamp: $(VENV)/lock.stamp pyproject.toml
 	@$(PIP) install --no-deps --no-build-isolation --editable .
+	@$(PYTHON) -m compileall -q integrators symplearn
 	@$(PIP) check
 	@touch $@
 

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as ox
 from jaxtyping import Array
 
 from ._counts import refuse_count
@@ -162,6 +161,8 @@ def _at(model, series, objective, prior):
 @eqx.filter_jit
 def _descend(model, series, objective, prior, scale, max_steps):
     """One run of BFGS: the best model met, BFGS's own inverse Hessian of the score, the steps."""
+    import optimistix as ox  # slow to import, and nothing else here needs it
+
     begin, rebuild = flatten(model)
     score = guarded(lambda free: negative_log_posterior(rebuild(free), series, objective, prior), begin.size)
     solver: Any = ox.BestSoFarMinimiser(ox.BFGS(rtol=1e-10, atol=1e-10))

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.special import logsumexp, ndtri
-from scipy.stats import qmc
 
 from ._importance import kish, softened
 from ._lane_loops import with_lane_loops
@@ -183,6 +182,8 @@ def _log_det(level: Level) -> float:
 @functools.cache
 def _normal(size: int) -> np.ndarray:
     """Points (draw, parameter) that fill a standard normal evenly, the same ones at every level."""
+    from scipy.stats import qmc  # slow to import, and nothing else here needs it
+
     # Scrambled, by a number that is part of the rule: unscrambled the first of Sobol's points is at 0.
     return ndtri(qmc.Sobol(size, rng=0).random(_DRAWS))
 

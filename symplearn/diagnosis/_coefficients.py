@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta, chi2, norm, truncnorm
+from scipy.special import betaincinv, gammaincinv, ndtr, ndtri
 
 from .._effects import NOISE, Candidate
 from ._calibrate import Priors
@@ -61,14 +61,14 @@ def _counted(name: str, values: dict[str, Any], number: float, noise: float = 1.
     """
     value, share, told = values[name], values.get("e", 1.0), number
     if "e" in values:
-        told = number * 2 * norm.sf(_STANDS_OUT / np.hypot(1.0, values["sd"] / noise))
+        told = number * 2 * ndtr(-_STANDS_OUT / np.hypot(1.0, values["sd"] / noise))
     some = max(told * share, 1.0)
     if name == "e":
         sd = np.sqrt(value * (1 - value) / told)
-        low, high = beta.ppf([0.025, 0.975], some + 0.5, max(told - some, 0.0) + 0.5)
+        low, high = betaincinv(some + 0.5, max(told - some, 0.0) + 0.5, [0.025, 0.975])
     else:
         sd = value / np.sqrt(2 * some)
-        low, high = value * np.sqrt(some / chi2.ppf([0.975, 0.025], some))
+        low, high = value * np.sqrt(0.5 * some / gammaincinv(0.5 * some, [0.975, 0.025]))
     return {"mean": value, "sd": float(sd), "interval95": [float(low), float(high)]}
 
 
@@ -77,8 +77,10 @@ def _single(problem: Problem, estimate: Estimate, place: int, inflation: float) 
     sd = float(np.sqrt(estimate.covariance[place, place] * inflation))
     lower = problem.lower_bounds(estimate.combination).get(place)
     if lower is None or mean - lower > 5 * sd:
-        low, high = (float(x) for x in norm.interval(0.95, mean, sd))
+        low, high = (float(mean + x * sd) for x in ndtri([0.025, 0.975]))
     else:
+        from scipy.stats import truncnorm  # slow to import, and seldom needed
+
         law = truncnorm((lower - mean) / sd, np.inf, mean, sd)
         low, high = (float(x) for x in law.ppf([0.025, 0.975]))
         mean, sd = float(law.mean()), float(law.std())

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import gammaln
-from scipy.stats import norm
 
 from .._effects import NOISE, OUTLIERS
+from ._evidence import log_density
 from ._problem import Combination, Problem
 
 # Degrees of freedom of the heavy-tailed noise that is weighed beside the Gaussian.
@@ -79,7 +79,7 @@ def factor_evidence(
         one = problem.candidate(member)
         if one.effect is NOISE:
             factor = np.log(noise[one.place] / problem.noise[one.place])
-            total += norm.logpdf(factor, scale=_FACTOR) + 0.5 * np.log(np.pi / max(number[one.place], 1.0))
+            total += log_density(factor, _FACTOR) + 0.5 * np.log(np.pi / max(number[one.place], 1.0))
     return float(total)
 
 
@@ -141,9 +141,9 @@ class Scales(NamedTuple):
     core: float = 1.0
 
     def _logs(self, e: np.ndarray) -> np.ndarray:
-        wide = norm.logpdf(e, scale=np.hypot(self.size, self.core))
+        wide = log_density(e, np.hypot(self.size, self.core))
         with np.errstate(divide="ignore"):
-            return np.stack([np.log(self.share) + wide, np.log1p(-self.share) + norm.logpdf(e, scale=self.core)])
+            return np.stack([np.log(self.share) + wide, np.log1p(-self.share) + log_density(e, self.core)])
 
     def belongs(self, e: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
         """Probability that each error has the wider noise."""
@@ -179,7 +179,7 @@ def outlier_evidence(
             e, off = errors[seen, one.place], flagged[seen, one.place]
             if not off.any():
                 return -np.inf
-            total += _two_scales(e, off, bool(free[one.place])) - norm.logpdf(e[~off]).sum()
+            total += _two_scales(e, off, bool(free[one.place])) - log_density(e[~off]).sum()
     return float(total)
 
 
@@ -193,7 +193,7 @@ def _two_scales(e: Float[np.ndarray, " row"], off: Bool[np.ndarray, " row"], fre
     share, n = min(scales.share, _SHARE), len(e)
     value = scales._replace(share=share).log_likelihood(e)
     value += 0.5 * np.log(2 * np.pi * share * (1 - share) / n) - np.log(_SHARE)
-    return float(value + 0.5 * np.log(np.pi / max(n * share, 1.0)) + norm.logpdf(0.0, scale=_SIZE))
+    return float(value + 0.5 * np.log(np.pi / max(n * share, 1.0)) + log_density(0.0, _SIZE))
 
 
 def outliers(errors: Float[np.ndarray, " row"], flagged: Bool[np.ndarray, " row"]) -> tuple[float, float]:

@@ -15,7 +15,6 @@ not the likelier for what it could have been without being seen.
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import log_ndtr, logsumexp
-from scipy.stats import norm
 
 from .._effects import EXCITATION
 from ._activity import log_fed
@@ -111,16 +110,16 @@ def turning_gain(centre: np.ndarray, spread: np.ndarray, scales: np.ndarray, alo
     if not inside.any():
         return 0.0
     c, e = points[inside].T
-    mass = norm.logpdf(normal[inside]).sum(1)
+    mass = log_density(normal[inside]).sum(1)
     ratio = 0.5 * np.log(c / e * scales[1] / scales[0])
     # Density of e given c: that of ln a, by |d ln a / d e| = 1 / (2 e).
-    turning = norm.logpdf(ratio, scale=_TURNING) - norm.logsf(np.log(_WITHIN), scale=_TURNING) - np.log(2 * e)
+    turning = log_density(ratio, _TURNING) - log_ndtr(-np.log(_WITHIN) / _TURNING) - np.log(2 * e)
     turning = np.where(ratio > np.log(_WITHIN), turning, -np.inf)
-    each = norm.logpdf(c[:, None], scale=size * scales[0])
+    each = log_density(c[:, None], size * scales[0])
     if not alone:
         each = each + 2 * np.log(c[:, None] / (size * scales[0]))
     strength = logsumexp(each, axis=1) - np.log(len(size))
-    wide = norm.logpdf(c, scale=scales[0]) + norm.logpdf(e, scale=scales[1]) + np.log(2.0)
+    wide = log_density(c, scales[0]) + log_density(e, scales[1]) + np.log(2.0)
     return float(logsumexp(mass + turning + strength - wide) - logsumexp(mass))
 
 
