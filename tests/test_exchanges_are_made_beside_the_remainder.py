@@ -20,6 +20,7 @@ from symplearn.diagnosis._found import Found
 from symplearn.diagnosis._prospects import Prospects
 from symplearn.diagnosis._refinement import Refinement
 from symplearn.diagnosis._score import Start, Unit
+from symplearn.diagnosis._sensors_beside import with_sensors
 from symplearn.diagnosis._start import priors_without_effects
 from symplearn.diagnosis._trajectory import Stepper
 from symplearn.diagnosis._weighed import Estimate
@@ -163,3 +164,22 @@ def test_the_true_law_is_found_beside_a_wandering_clock():
     found = weigher.found
     assert found.of(drag, "clock").log_evidence > found.best(damping) + 10
     assert max(found.estimates, key=found.odds) == drag
+
+
+def test_a_drift_is_tried_where_an_error_that_lasts_stands_for_it():
+    """Of a damped swing whose sensor drifts only the damping was weighed, and an error that remembers itself is ahead
+    of white noise beside it: damping and drift are weighed from there, and are the likeliest."""
+    motion = cases.solved(lambda t, x: [x[1], -x[0] - 0.05 * x[1]], [1.0, 0.0], LATE)
+    readings = motion[:, 0] + 0.004 * LATE + 0.02 * np.random.default_rng(5).normal(size=len(LATE))
+    p = cases.problem(cases.simulation("p**2/2 + q**2/2"), [cases.recorded(LATE, readings)], 0.05)
+    wanted = {p.candidate(m).effect.name: m for m in p.searched if m == p.whole(m)}
+    few = replace(p, searched=tuple(wanted[name] for name in ("viscous_damping", "sensor_drift", "sensor_gain")))
+    weigher = cases.weigher(few, motion[:, 0], motion[:, 1])
+    damping, both = (wanted["viscous_damping"],), tuple(sorted((wanted["viscous_damping"], wanted["sensor_drift"])))
+    weigher.weigh([Start((), weigher.found.priors.mean, 0.0), Start(damping, weigher.found.priors.mean, 0.0)])
+    kinds = {e.kind: e.log_evidence for e in weigher.found.estimates[damping]}
+    assert kinds["coloured"] > kinds["white"] + 5
+    starts = with_sensors(weigher, [damping])
+    assert {s.combination for s in starts} == {both, tuple(sorted((*damping, wanted["sensor_gain"])))}
+    Refinement(Prospects(weigher), lambda line: None).weigh_beside_the_remainder()
+    assert max(weigher.found.estimates, key=weigher.found.odds) == both

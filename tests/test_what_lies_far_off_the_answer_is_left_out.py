@@ -1,10 +1,10 @@
-"""Where readings were left in as no outliers of a motion that was not understood, those of the answer are found."""
+"""Where no reading was left out, as of a motion that was not understood, the outliers of the answer are found."""
 
 import engine_cases as cases
 import numpy as np
 import pytest
 
-from symplearn.diagnosis import _far_off
+from symplearn.diagnosis import Options, _far_off, diagnose, restriction_of
 from symplearn.diagnosis._build import Restriction, augmented_equations, build
 from symplearn.diagnosis._far_off import weigh_without_far
 from symplearn.diagnosis._score import Start
@@ -46,19 +46,11 @@ def outlying():
     return weighed(FAR)
 
 
-def test_no_column_that_was_not_left_in_is_looked_at(outlying):
-    """Nothing is weighed for it."""
-    weigher, _ = outlying
-    before = set(weigher.found.estimates)
-    assert not weigh_without_far(weigher, frozenset())
-    assert set(weigher.found.estimates) == before and weigher.base == () and weigher.stepper is weigher.plain
-
-
 def test_those_far_off_the_answer_are_left_out(outlying):
     """These five of 150 readings and no others, thirty of the noise off, in place of a larger noise; the likeliest is
     then the damping with outliers, whose coefficient is what it was to within three of its errors."""
     weigher, expected = outlying
-    assert weigh_without_far(weigher, frozenset({0}))
+    assert weigh_without_far(weigher)
     assert np.nonzero(weigher.flagged[0][:, 0])[0].tolist() == FAR
     best = max(weigher.found.estimates, key=weigher.found.odds)
     assert set(best) == set(expected) and weigher.base == expected[1:]
@@ -68,16 +60,16 @@ def test_those_far_off_the_answer_are_left_out(outlying):
 
 @pytest.mark.parametrize(
     ("spared", "asked"), [(frozenset({0}), True), pytest.param(frozenset(), False, marks=pytest.mark.slow)],
-    ids=["left in", "not"],
+    ids=["left in", "taken out"],
 )  # fmt: skip
-def test_a_search_that_leaves_readings_in_asks_again(spared, asked):
+def test_a_search_that_left_none_out_asks_at_last(spared, asked):
     """Whether they were taken out at the beginning or at last, the damping is told with the same five outliers."""
     _, p = read(FAR)
     stepper, said = Stepper(p), []
     seeds = first_fits(stepper, priors_without_effects(p), [r.fitted for r in p.rows])
     search = Search(stepper, seeds.z, np.inf, said.append, spared)
     found = search.run()
-    assert ("weighing the best combinations without what lies far off" in said) == asked
+    assert ("looking for readings far off the likeliest answer" in said) == asked
     best = max(found.estimates, key=found.odds)
     assert {p.candidate(m).effect.name for m in best} == {"viscous_damping", "sensor_outliers"}
     assert np.nonzero(search.weigher.flagged[0][:, 0])[0].tolist() == FAR
@@ -87,7 +79,7 @@ def test_where_they_turn_out_to_be_none_all_stay_in_again(monkeypatch):
     """As they were, for whatever is weighed next."""
     weigher, _ = weighed(FAR)
     monkeypatch.setattr(_far_off, "doubtful_outliers", lambda *_: frozenset({0}))
-    assert not weigh_without_far(weigher, frozenset({0}))
+    assert not weigh_without_far(weigher)
     assert weigher.base == () and weigher.stepper is weigher.plain and not weigher.flagged[0].any()
 
 
@@ -95,5 +87,30 @@ def test_without_such_readings_all_stay_in():
     """Nothing is weighed again."""
     weigher, _ = weighed([])
     before = set(weigher.found.estimates)
-    assert not weigh_without_far(weigher, frozenset({0}))
+    assert not weigh_without_far(weigher)
     assert set(weigher.found.estimates) == before and weigher.base == () and weigher.stepper is weigher.plain
+
+
+@pytest.mark.slow
+def test_what_a_force_passed_through_is_told_at_last():
+    """Two swings of which nothing says that they are coupled: a force on each that follows what is read goes through
+    readings that are ten times the noise off, and the coupling leaves them."""
+    rng = np.random.default_rng(22)
+    times = 0.19 * np.arange(128) + 0.04 * rng.uniform(-1, 1, 128) * (np.arange(128) > 0)
+
+    def rates(t, x):
+        between = 0.12 * (x[0] - x[1]) + 0.025 * (x[2] - x[3])
+        return [x[2], x[3], -4 * np.sin(x[0]) - between, -4 * np.sin(x[1]) + between]
+
+    shown = cases.solved(rates, [0.8, -0.1, 0.0, 0.3], times)[:, :2]
+    readings = shown + [0.02, 0.015] * rng.normal(size=shown.shape)
+    far = np.sort(rng.choice(128, 5, replace=False))
+    readings[far, 0] += 0.2 * rng.normal(size=len(far))
+    file = cases.simulation(
+        "(p**2 + s**2)/2 - G*(cos(a) + cos(b))", ("a", "b"), ("p", "s"), {"y0": "a", "y1": "b"},
+        "[parameters]\nG = { value = 4.0, sd = 0.05 }\n[recording.noise]\ny0 = 0.02\ny1 = 0.015\n",
+    )  # fmt: skip
+    some = restriction_of(["relative_damping", "coupling_spring", "viscous_damping", "sensor_noise", "sensor_outliers"])
+    document = diagnose(file, [cases.recorded(times, readings)], Options(restriction=some, jobs=1)).document
+    told = {finding["effect"] for finding in document["findings"]}
+    assert told == {"relative_damping", "coupling_spring", "sensor_outliers"} and document["probability"] > 0.9

@@ -1,10 +1,10 @@
-"""Readings that lie far off the likeliest answer, where they had been left in as no outliers of another motion.
+"""Readings that lie far off the likeliest answer, where none were left out.
 
-A motion that a search cannot follow yet has its outliers in other places. Once these turn out to be none, all readings
-of their sensors are left in; the answer that is then found may have outliers of its own.
+A motion that a search cannot follow yet has its outliers in other places, or none: a force that is bent towards every
+reading passes through them. The answer that is then found may have outliers of its own.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,11 +18,10 @@ from ._weighed import standardised
 from ._weigher import KEPT, Weigher
 
 
-def weigh_without_far(weigher: Weigher, spared: frozenset[int]) -> bool:
-    """The best combinations again without the readings of some columns that lie far off the very best of them, and
-    whether one with these outliers is the likeliest: if so, they stay left out."""
-    problem, found = weigher.plain.problem, weigher.found
-    columns = {j: m for j, m in weigher.outlier_columns.items() if j in spared}
+def weigh_without_far(weigher: Weigher) -> bool:
+    """The best combinations again without the readings that lie far off the very best of them, and whether one with
+    these outliers is the likeliest: if so, they stay left out."""
+    problem, found, columns = weigher.plain.problem, weigher.found, weigher.outlier_columns
     ranked = [c for c in sorted(found.estimates, key=found.odds, reverse=True) if found.of(c, "white")]
     fit, weight = weigher.as_fitted(ranked[:1]), weights(problem, weigher.rows)
     errors = standardised([x[0] for x in residuals(problem, fit.predictions, weight)], weight, fit.noise[0])
@@ -31,7 +30,7 @@ def weigh_without_far(weigher: Weigher, spared: frozenset[int]) -> bool:
     members = tuple(sorted(m for j, m in columns.items() if any(bad[:, j].any() for bad in far)))[: USUAL - 1]
     if not members:
         return False
-    starts = _starts(weigher, [(), *ranked[:KEPT]], columns, members)
+    starts = _starts(weigher, [(), *ranked[:KEPT]], members)
     owed = weigher.owed_for(members, errors, np.concatenate(far), fit.noise[0], np.concatenate(weight))
     weigher.leave_out(far, members, owed)
     weigher.weigh(starts, whole=True)
@@ -41,16 +40,15 @@ def weigh_without_far(weigher: Weigher, spared: frozenset[int]) -> bool:
     return bool(weigher.base)
 
 
-def _starts(
-    weigher: Weigher, combinations: Sequence[Combination], columns: Mapping[int, int], members: Combination
-) -> list[Start]:
-    """Where combinations were found, with outliers in place of a larger noise of their columns."""
-    problem, starts = weigher.plain.problem, dict[Combination, Start]()
+def _starts(weigher: Weigher, combinations: Sequence[Combination], members: Combination) -> list[Start]:
+    """Where combinations were found, with outliers in place of a larger noise of their columns, and beside it."""
+    problem, starts = weigher.problem, dict[Combination, Start]()
+    far = {problem.candidate(m).place for m in members}
     for combination in combinations:
         white = weigher.found.of(combination, "white")
         ones = [(m, problem.candidate(m)) for m in combination]
-        rest = [m for m, one in ones if one.effect is not NOISE or one.place not in columns]
-        some = tuple(sorted({*rest, *members}))
-        if white is not None and len(some) <= weigher.most:
-            starts.setdefault(some, Start(some, white.z, 0.0))
+        rest = tuple(m for m, one in ones if one.effect is not NOISE or one.place not in far)
+        for some in (tuple(sorted({*one, *members})) for one in (rest, combination)):
+            if white is not None and len(some) <= weigher.most:
+                starts.setdefault(some, Start(some, white.z, 0.0))
     return list(starts.values())

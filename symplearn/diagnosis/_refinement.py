@@ -17,7 +17,9 @@ from ._problem import Combination, Problem
 from ._prospects import MANY, Prospects
 from ._scan import ends, spacing
 from ._score import Start, inverse
+from ._sensors_beside import with_sensors
 from ._strength import strength_entries
+from ._weighed import Estimate
 from ._weigher import KEPT, Weigher
 
 # Combinations whose places are moved, and how near the best one is what is looked at.
@@ -148,10 +150,18 @@ class Refinement:
         """What may do as well as the likeliest of every size beside the remainder that the best answer leaves: a search
         under white noise looks for what takes a part of it."""
         ranked = sorted(self._mine(), key=self.found.odds, reverse=True)
-        top, rest = self.found.odds(ranked[0]), speaker(self.found.estimates[ranked[0]])
-        if rest.kind in ("white", "jitter", "static", "force", "spell"):
+        if not _is_of_sensors(speaker(self.found.estimates[ranked[0]])):
             return
         self.progress("weighing what may do as well beside the remainder")
+        if starts := with_sensors(self.weigher, ranked):
+            self.weigher.weigh(starts, whole=True)
+        best, ranked = ranked[0], sorted(self._mine(), key=self.found.odds, reverse=True)
+        if ranked[0] != best:
+            self.weigh_like_the_best()
+            ranked = sorted(self._mine(), key=self.found.odds, reverse=True)
+        top, rest = self.found.odds(ranked[0]), speaker(self.found.estimates[ranked[0]])
+        if not _is_of_sensors(rest):
+            return
         some: dict[Combination, Start] = {}
         for c in self._bases([c for c in ranked if self.found.odds(c) > top - _BEHIND]):
             least = top - self.found.odds(c) - 2 * _NEAR
@@ -289,3 +299,8 @@ class Refinement:
         others = np.clip(white.z - spread[:, some] @ pull, *self.found.priors.bounds_of(self.problem, larger))
         left = white.log_evidence - 0.5 * float(white.z[some] @ pull)
         return self.problem.carried(others, larger, combination), left if np.isfinite(left) else -np.inf
+
+
+def _is_of_sensors(estimate: Estimate) -> bool:
+    """Whether what an answer leaves is an error of sensors or of the clock that lasts."""
+    return estimate.kind not in ("white", "jitter", "static", "force", "spell")

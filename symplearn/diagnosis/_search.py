@@ -337,10 +337,10 @@ class Search:
         self.weigher.weigh_with_outliers_in()
 
     def _weigh_with_outliers_out(self) -> None:
-        """Where readings were left in since they were no outliers of the motion then known: those that are of this."""
-        if self.beginning.spared and not self.base and self.in_time():
-            self.progress("weighing the best combinations without what lies far off")
-            if weigh_without_far(self.weigher, self.beginning.spared):
+        """Where no readings were left out, as no outliers of the motion then known: those that are of this."""
+        if not self.base and self.in_time():
+            self.progress("looking for readings far off the likeliest answer")
+            if weigh_without_far(self.weigher):
                 self.beginning.paths = [replace(path, combination=self.base) for path in self.beginning.paths]
 
     def add_forces(self, combinations: Sequence[Combination], every: int) -> None:
