@@ -83,6 +83,19 @@ def test_where_they_turn_out_to_be_none_all_stay_in_again(monkeypatch):
     assert weigher.base == () and weigher.stepper is weigher.plain and not weigher.flagged[0].any()
 
 
+@pytest.mark.parametrize("doubted", [False, True])
+def test_what_was_out_before_stays_out(monkeypatch, doubted):
+    """A reading that a term of the simulation takes for an outlier is left out beside those that are found, and alone
+    where these turn out to be none."""
+    weigher, _ = weighed(FAR)
+    known = np.arange(len(TIMES))[:, None] == 5
+    weigher.leave_out([known], (), 0.0)
+    if doubted:
+        monkeypatch.setattr(_far_off, "doubtful_outliers", lambda *_: frozenset({0}))
+    assert weigh_without_far(weigher) != doubted
+    assert np.nonzero(weigher.flagged[0][:, 0])[0].tolist() == ([5] if doubted else [5, *FAR])
+
+
 def test_without_such_readings_all_stay_in():
     """Nothing is weighed again."""
     weigher, _ = weighed([])

@@ -137,7 +137,7 @@ def _quadrant(reach: np.ndarray, correlation: np.ndarray) -> float:
     """Probability that two are above minus `reach`, exactly (Owen 1956)."""
     a, b = np.where(reach == 0, _AT_THE_BOUND, reach) / np.sqrt(np.diag(correlation))
     rho = correlation[0, 1] / np.sqrt(correlation[0, 0] * correlation[1, 1])
-    root = np.sqrt(1.0 - rho**2)
+    root = np.sqrt(max(1.0 - rho**2, _TINY))
     beside = owens_t(a, (b / a - rho) / root) + owens_t(b, (a / b - rho) / root)
     return float(0.5 * (ndtr(a) + ndtr(b) - ((a < 0) != (b < 0))) - beside)
 

@@ -26,17 +26,19 @@ def weigh_without_far(weigher: Weigher) -> bool:
     fit, weight = weigher.as_fitted(ranked[:1]), weights(problem, weigher.rows)
     errors = standardised([x[0] for x in residuals(problem, fit.predictions, weight)], weight, fit.noise[0])
     parts = suspects(np.split(errors, np.cumsum(weigher.rows)[:-1]))
-    far = [bad & np.isin(np.arange(problem.channels), list(columns)) for bad in parts]
-    members = tuple(sorted(m for j, m in columns.items() if any(bad[:, j].any() for bad in far)))[: USUAL - 1]
+    able, before = np.isin(np.arange(problem.channels), list(columns)), weigher.flagged
+    members = tuple(sorted(m for j, m in columns.items() if any(bad[:, j].any() for bad in parts)))[: USUAL - 1]
     if not members:
         return False
+    # Those that a known term takes for outliers stay out.
+    far = [bad & able | was[: len(bad)] for bad, was in zip(parts, before, strict=True)]
     starts = _starts(weigher, [(), *ranked[:KEPT]], members)
     owed = weigher.owed_for(members, errors, np.concatenate(far), fit.noise[0], np.concatenate(weight))
     weigher.leave_out(far, members, owed)
     weigher.weigh(starts, whole=True)
     best = speaker(found.estimates[max(found.estimates, key=found.odds)])
     if doubtful_outliers(problem, members, best):
-        weigher.leave_out([np.zeros_like(bad) for bad in far], (), 0.0)
+        weigher.leave_out(before, (), 0.0)
     return bool(weigher.base)
 
 
