@@ -13,6 +13,7 @@ from scipy.special import ndtr, ndtri
 
 from ._errors import InputError
 from ._forecast import Forecast
+from ._normal import log_density
 from ._predict import PosteriorForecast
 
 
@@ -124,7 +125,7 @@ def _of_normal(forecast: Forecast, rows: np.ndarray, y: np.ndarray, level: float
     mean, sd = np.asarray(forecast.means)[rows], np.asarray(forecast.sds)[rows]
     _refuse_no_spread(sd)
     inside = np.abs(y - mean) <= ndtri(0.5 + 0.5 * level) * sd
-    return mean, np.asarray(forecast.path)[rows], _log_density(y, mean, sd), normal_crps(mean, sd, y), inside
+    return mean, np.asarray(forecast.path)[rows], log_density(y - mean, sd), normal_crps(mean, sd, y), inside
 
 
 def _of_draws(forecast: PosteriorForecast, rows: np.ndarray, y: np.ndarray, level: float) -> Any:
@@ -136,11 +137,7 @@ def _of_draws(forecast: PosteriorForecast, rows: np.ndarray, y: np.ndarray, leve
     _refuse_no_spread(sd)
     low, high = np.nanquantile(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
     inside = (low <= y) & (y <= high)
-    return mean, np.asarray(forecast.map_path)[rows], _log_density(y, mean, sd), fair_crps(draws, y), inside
-
-
-def _log_density(y: Any, mean: Any, sd: Any) -> np.ndarray:
-    return -0.5 * ((y - mean) / sd) ** 2 - np.log(sd) - 0.5 * math.log(2 * math.pi)
+    return mean, np.asarray(forecast.map_path)[rows], log_density(y - mean, sd), fair_crps(draws, y), inside
 
 
 def _refuse_no_spread(sd: np.ndarray) -> None:
@@ -167,7 +164,7 @@ def fair_crps(
 def normal_crps(mean: Any, sd: Any, y: Any) -> np.ndarray:
     """sd (w (2 Phi(w) - 1) + 2 phi(w) - 1 / sqrt(pi)), w = (y - mean) / sd. Gneiting and Raftery (2007), eq. 21."""
     w = (np.asarray(y) - mean) / sd
-    return sd * (w * (2 * ndtr(w) - 1) + 2 * np.exp(_log_density(w, 0.0, 1.0)) - 1 / math.sqrt(math.pi))
+    return sd * (w * (2 * ndtr(w) - 1) + 2 * np.exp(log_density(w)) - 1 / math.sqrt(math.pi))
 
 
 def _energy_errors(forecast: Any, energy: Callable[[Any], Any], start: Any) -> tuple[float, float]:

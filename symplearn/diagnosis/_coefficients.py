@@ -79,7 +79,7 @@ def _single(problem: Problem, estimate: Estimate, place: int, inflation: float) 
     if lower is None or mean - lower > 5 * sd:
         low, high = (float(mean + x * sd) for x in ndtri([0.025, 0.975]))
     else:
-        from scipy.stats import truncnorm  # slow to import, and seldom needed
+        from scipy.stats import truncnorm  # slow to import, and not always needed
 
         law = truncnorm((lower - mean) / sd, np.inf, mean, sd)
         low, high = (float(x) for x in law.ppf([0.025, 0.975]))

@@ -1,11 +1,12 @@
 """Evidence of one combination of effects: Laplace's integral over the unknowns, from a Gram matrix of innovations."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import erfcx, log_ndtr, ndtr, owens_t
+
+from .._normal import log_density
 
 # Probabilities of a half space below this are as good as impossible.
 _TINY = 1e-300
@@ -19,7 +20,8 @@ _CERTAIN = 8.0
 # was off by 0.006 at most, as with the million that SciPy would take; a dozen took 11 ms each at most, and 76 ms there.
 _POINTS = 2000
 # Standard deviations beyond a bound from which a cubature of the allowed region is no longer to be trusted, and a
-# probability that is lost in its errors, as in those of a difference of numbers near one.
+# probability that is lost in its errors, as in those of a difference of numbers near one: such are taken one after the
+# other, which is off by more where they exclude each other.
 _FAR, _LOST = -4.0, 1e-9
 # A reach of nothing at all, which a quadrant divides by.
 _AT_THE_BOUND = 1e-150
@@ -144,17 +146,12 @@ def _quadrant(reach: np.ndarray, correlation: np.ndarray) -> float:
 
 def _cubature(reach: np.ndarray, correlation: np.ndarray) -> float:
     """The same of any number of them."""
-    from scipy.stats import multivariate_normal  # slow to import, and seldom needed
+    from scipy.stats import multivariate_normal  # slow to import, and not always needed
 
     some = _POINTS * len(reach)
     return float(
         multivariate_normal.cdf(reach, cov=correlation, allow_singular=True, maxpts=some, rng=np.random.default_rng(0))
     )
-
-
-def log_density(x: Any, sd: Any = 1.0) -> Any:
-    """Of a normal about zero; SciPy's own checks of shapes and bounds cost a search seconds."""
-    return -0.5 * (x / sd) ** 2 - np.log(sd) - 0.5 * np.log(2 * np.pi)
 
 
 def orthants(

@@ -57,7 +57,7 @@ class Refinement:
     def move_places(self) -> None:
         """Try the best combinations with their times, thresholds and frequencies moved by steps of the grid, and those
         that did not converge from where they are: damped anew, many get where they were going."""
-        ranked = sorted(self._mine(), key=self.found.odds, reverse=True)
+        ranked = self._likeliest()
         near = [c for c in ranked if self.found.odds(c) > self.found.odds(ranked[0]) - _NEAR]
         starts = []
         for k, c in enumerate(near):
@@ -149,16 +149,11 @@ class Refinement:
     def weigh_beside_the_remainder(self) -> None:
         """What may do as well as the likeliest of every size beside the remainder that the best answer leaves: a search
         under white noise looks for what takes a part of it."""
-        ranked = sorted(self._mine(), key=self.found.odds, reverse=True)
-        if not _is_of_sensors(speaker(self.found.estimates[ranked[0]])):
+        if not _is_of_sensors(speaker(self.found.estimates[self._likeliest()[0]])):
             return
         self.progress("weighing what may do as well beside the remainder")
-        if starts := with_sensors(self.weigher, ranked):
-            self.weigher.weigh(starts, whole=True)
-        best, ranked = ranked[0], sorted(self._mine(), key=self.found.odds, reverse=True)
-        if ranked[0] != best:
-            self.weigh_like_the_best()
-            ranked = sorted(self._mine(), key=self.found.odds, reverse=True)
+        self._weigh_sensors()
+        ranked = self._likeliest()
         top, rest = self.found.odds(ranked[0]), speaker(self.found.estimates[ranked[0]])
         if not _is_of_sensors(rest):
             return
@@ -174,6 +169,14 @@ class Refinement:
             weigh_later_clocks(self.weigher, list(some))
             share_clocks(self.weigher)
 
+    def _weigh_sensors(self) -> None:
+        """Errors of sensors that have a name beside the likeliest; where one of these is ahead, what does as well."""
+        before = self._likeliest()
+        if starts := with_sensors(self.weigher, before):
+            self.weigher.weigh(starts, whole=True)
+            if self._likeliest()[0] != before[0]:
+                self.weigh_like_the_best()
+
     def _bases(self, ranked: Sequence[Combination]) -> list[Combination]:
         """The best of every size, and the best without an unseen oscillator, which no exchange takes out."""
         found = []
@@ -186,7 +189,7 @@ class Refinement:
     def weigh_grown(self) -> None:
         """Combinations that are less likely than a part of their own, with an effect at another time, threshold or
         frequency than that has it, from the part's fit: they stopped at a poorer optimum."""
-        ranked = sorted(self._mine(), key=self.found.odds, reverse=True)
+        ranked = self._likeliest()
         starts: dict[Combination, Start] = {}
         for part in ranked[:KEPT]:
             grown = [c for c in ranked if len(c) == len(part) + 1 and set(part) < set(c)]
@@ -213,6 +216,10 @@ class Refinement:
     def _mine(self) -> list[Combination]:
         """Combinations that the outliers which were taken out are part of."""
         return [c for c in self.found.estimates if set(self.weigher.base) <= set(c)]
+
+    def _likeliest(self) -> list[Combination]:
+        """The same, the likeliest first."""
+        return sorted(self._mine(), key=self.found.odds, reverse=True)
 
     def _with_stops_moved(self, combination: Combination) -> list[Start]:
         """A fitted combination with each of its stops harder or softer; nothing once more from the same fit."""

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.special import gammaln
 
 from .._effects import NOISE, OUTLIERS
-from ._evidence import log_density
+from .._normal import log_density
 from ._problem import Combination, Problem
 
 # Degrees of freedom of the heavy-tailed noise that is weighed beside the Gaussian.

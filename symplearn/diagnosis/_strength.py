@@ -17,9 +17,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import log_ndtr, logsumexp
 
 from .._effects import EXCITATION
+from .._normal import log_density
 from ._activity import log_fed
 from ._calibrate import Priors
-from ._evidence import cut_off, log_density
+from ._evidence import cut_off
 from ._mixture import over_choices, over_widest
 from ._problem import Combination, Problem
 from ._squares import log_product_of_squares
