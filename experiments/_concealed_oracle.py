@@ -4,7 +4,7 @@ It gives each coefficient's interval, the held-out and the forecast error, and w
 its form must beat nothing by 14 and every rival of its size by 6 in BIC. Rivals of a single effect are all words on all
 targets, ranked by the BIC that their linear response promises; the closest are fitted in full. Rivals of a pair
 exchange one member by every other effect. A remainder is known to the oracle, and noise has its true standard
-deviation.
+deviation. It is asked twice: of all rows, and of those that a diagnosis may fit, the first three quarters.
 """
 
 import csv
@@ -30,7 +30,7 @@ from ._concealed_sensors import Setup
 
 NOTHING, OTHERS = 14.0, 6.0
 FITTED = 8  # rivals that are fitted in full, for each member: the ranks of linear responses are not exact
-VERSION = 5  # what was kept by another is computed again
+VERSION = 6  # what was kept by another is computed again
 HELD_OUT = 0.25
 EDGE = 0.05  # part of the recording at either end in which a rival's jump does not count
 # A rival that leaves more chi-square, and a larger part of it, than this by its linear response is not fitted.
@@ -65,27 +65,50 @@ def seen_rows(recording: Path, answer: dict[str, Any]) -> tuple[np.ndarray, ...]
 
 def consulted(answer: dict[str, Any], seen: tuple[np.ndarray, ...]) -> dict[str, Any]:
     """The oracle's answer."""
-    setup, public = read_setup(answer)
-    effects, remainder = read_effects(answer["effects"]), read_effects(answer["remainder"])
-    moving = tuple(e for e in effects if e.word not in NOISY)
-    given = Given(without_outliers(answer, effects, seen), weights(setup))
-    truth = _opened(form_of(setup, public, (*moving, *remainder)), len(moving))
+    effects = read_effects(answer["effects"])
+    truth, given, moving = _true(answer, seen)
     best = _fitted(truth, given, moving)
-    found: dict[str, Any] = {
+    return {
         "widths": _widths(best, moving) | noise_widths(effects, seen),
         "holdout": _held_out(truth, given, seen, moving),
         "forecast": _forecast(best, answer),
         "rms": best.rms,
-        "nameable": False,
+        **_naming(answer, seen, best),
+        "early": _naming(*early(answer, seen)),
     }
+
+
+def early(answer: dict[str, Any], seen: tuple[np.ndarray, ...]) -> tuple[dict[str, Any], tuple[np.ndarray, ...]]:
+    """A case as it were if every recording ended where those rows begin that a diagnosis keeps from its fits."""
+    records, cuts = [], _cuts(seen)
+    for record, k in zip(answer["records"], cuts, strict=True):
+        records.append(record | {"times": record["times"][:k], "after": [*record["times"][k:], *record["after"]]})
+    clean = [one[:k] for one, k in zip(answer["clean"], cuts, strict=True)]
+    return answer | {"records": records, "clean": clean}, tuple(r[:k] for r, k in zip(seen, cuts, strict=True))
+
+
+def _true(answer: dict[str, Any], seen: tuple[np.ndarray, ...]) -> tuple[Form, Given, tuple[Effect, ...]]:
+    """The form of the truth with its coefficients free, what it is fitted to, and those of its effects that move."""
+    setup, public = read_setup(answer)
+    effects, remainder = read_effects(answer["effects"]), read_effects(answer["remainder"])
+    moving = tuple(e for e in effects if e.word not in NOISY)
+    form = _opened(form_of(setup, public, (*moving, *remainder)), len(moving))
+    return form, Given(without_outliers(answer, effects, seen), weights(setup)), moving
+
+
+def _naming(answer: dict[str, Any], seen: tuple[np.ndarray, ...], best: Fitted | None = None) -> dict[str, Any]:
+    """Whether the truth can be named, and by how much it is ahead; `best` is its fit, where there is one already."""
+    effects = read_effects(answer["effects"])
     if not effects or any(e.word in OUTSIDE for e in effects):
-        return found
+        return {"nameable": False}
+    truth, given, moving = _true(answer, seen)
     margins = noise_margins(answer, effects, seen)
     if moving:
-        margins |= _margins(answer, public, truth, given, best, moving)
+        public = read_setup(answer)[1]
+        margins |= _margins(answer, public, truth, given, best or _fitted(truth, given, moving), moving)
     named = all(margins[m] > NOTHING for m in margins if m.startswith("nothing"))
     named &= all(margins[m] > OTHERS for m in margins if not m.startswith("nothing"))
-    return found | {"margins": margins, "nameable": bool(named)}
+    return {"margins": margins, "nameable": bool(named)}
 
 
 def _opened(form: Form, moving: int) -> Form:
@@ -172,9 +195,14 @@ def _widths(best: Fitted, moving: Sequence[Effect]) -> dict[str, float]:
     }
 
 
+def _cuts(seen: Sequence[np.ndarray]) -> list[int]:
+    """How many rows of each recording a diagnosis may fit."""
+    return [len(rows) - int(HELD_OUT * len(rows) + 1e-9) for rows in seen]
+
+
 def _held_out(truth: Form, given: Given, seen: tuple[np.ndarray, ...], moving: Sequence[Effect]) -> float:
     """Rms error over the last quarter of a fit to the rest, in sd."""
-    cut = [len(r) - int(HELD_OUT * len(r) + 1e-9) for r in given.readings]
+    cut = _cuts(given.readings)
     early = [np.where(np.arange(len(r))[:, None] < k, r, np.nan) for r, k in zip(given.readings, cut, strict=True)]
     best = _fitted(truth, given._replace(readings=tuple(early)), moving, most=12)
     found = truth.readings(best.theta[:, None])

@@ -21,12 +21,14 @@ def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
     found["with a remainder"] = [r for r in concealed if r["remainder"]]
     found["outside the vocabulary"] = [r for r in concealed if r["outside"]]
     found["oracle can name"] = [r for r in concealed if nameable(r)]
+    found["of the fitted rows"] = [r for r in concealed if nameable(r, "early")]
     return {name: members for name, members in found.items() if members}
 
 
-def nameable(r: Row) -> bool:
-    """Whether the oracle itself can name the truth."""
-    return bool(r["oracle"]) and bool(r["oracle"].get("nameable")) and not r["outside"]
+def nameable(r: Row, part: str | None = None) -> bool:
+    """Whether the oracle itself can name the truth, of all rows or of a part of them."""
+    told = (r["oracle"] or {}).get(part, {}) if part else r["oracle"] or {}
+    return bool(told.get("nameable")) and not r["outside"]
 
 
 def share(values: Iterable[bool]) -> float | None:

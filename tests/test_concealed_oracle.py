@@ -7,10 +7,10 @@ from concealed_cases import case_of, setting
 from experiments import _concealed_hiding, _concealed_rivals
 from experiments._concealed_effects import Effect
 from experiments._concealed_equivalent import equivalent, swallowed
-from experiments._concealed_files import answer, recording_file
+from experiments._concealed_files import answer, read_setup, recording_file
 from experiments._concealed_fit import Free, Given, fit
 from experiments._concealed_hiding import clean_readings, form_of, starts, weights
-from experiments._concealed_oracle import asked, consulted
+from experiments._concealed_oracle import asked, consulted, early
 from experiments._concealed_rivals import candidates, nuisances, ranked, responses
 
 
@@ -39,9 +39,37 @@ def test_a_strong_effect_is_named_and_a_weak_one_is_not():
     strong, weak = told[0.06], told[0.0002]
     assert strong["nameable"] and strong["margins"]["nothing"] > 100
     assert not weak["nameable"] and weak["margins"]["nothing"] < 14
+    # Of three quarters of the rows as well, by less.
+    assert strong["early"]["nameable"] and not weak["early"]["nameable"]
+    assert 100 < strong["early"]["margins"]["nothing"] < strong["margins"]["nothing"]
     # Noise of 80 rows: a rms of 1 with a standard error of 8 %; the forecast is far inside the noise.
     assert strong["rms"] == pytest.approx(1.0, abs=0.25) and strong["forecast"] < 1.0
     assert 0 < strong["widths"]["viscous_damping|theta|c"] < 0.2 * 0.06 * size
+
+
+def test_what_comes_late_is_named_of_all_rows_alone():
+    """A blow in the last quarter of the rows is plain in all of them, and nothing in those before."""
+    setup, public = setting("pendulum", ["angle_rad"], rows=80, noise=0.01)
+    size, times = setup.values["m"] * setup.values["l"] ** 2, setup.records[0].times
+    strength = float(0.3 * size * 2 * np.pi / setup.system.period(setup.values))
+    late = Effect("impulse", "theta", {"j": strength, "t_star": float(times[66] + 0.3 * times[1])})
+    case = case_of(setup, public, late)
+    told = consulted(answer(case), case.noisy)
+    assert told["margins"]["nothing"] > 100 and told["early"]["margins"]["nothing"] < 0
+    assert told["nameable"] and not told["early"]["nameable"]
+
+
+def test_a_case_cut_short_is_the_same_case():
+    """Its rows are the first ones of every recording, with their true readings, and its inputs go on beyond them."""
+    setup, public = setting("driven_spring", ["q_m"], rows=62)
+    whole = answer(case := case_of(setup, public, Effect("cubic_stiffness", "q", {"k": 1.0})))
+    short, seen = early(whole, case.noisy)
+    (record,), (before,) = short["records"], whole["records"]
+    assert len(record["times"]) == 47 and record["times"] + record["after"] == before["times"] + before["after"]
+    assert np.array_equal(seen[0], case.noisy[0][:47]) and short["clean"] == [whole["clean"][0][:47]]
+    theirs, mine = (read_setup(one)[0].records[0] for one in (whole, short))
+    assert theirs.inputs is not None and np.array_equal(theirs.inputs.times, mine.inputs.times)
+    assert np.array_equal(theirs.inputs.values, mine.inputs.values) and len(mine.times) == 47
 
 
 def test_a_drag_of_another_power_is_a_rival():

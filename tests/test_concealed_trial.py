@@ -201,6 +201,16 @@ def test_a_right_answer_scores():
     )
 
 
+def test_what_can_be_named_is_told_for_all_rows_and_for_the_fitted():
+    """A truth that the last rows alone tell counts among what the oracle can name, and not among what it can of those
+    rows that are fitted."""
+    told = {"nameable": True, "widths": {}, "early": {"nameable": False}}
+    late = row("case_001", DAMPED, result(NAMED), told)
+    both = row("case_002", DAMPED, result(NAMED), told | {"early": {"nameable": True}})
+    groups = metrics([late, both, row("case_003", DAMPED, result(NAMED), None)])["groups"]
+    assert (groups["oracle can name"]["cases"], groups["of the fitted rows"]["cases"]) == (2, 1)
+
+
 def test_a_forecast_counts_as_far_as_it_goes():
     """Times beyond the last that was asked are left out, not held at its value."""
     short = result(NAMED)
