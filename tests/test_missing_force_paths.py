@@ -10,11 +10,11 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import multivariate_normal, norm, t
 
 from symplearn.diagnosis._calibrate import calibrate, residuals, weights
+from symplearn.diagnosis._magnitude import strength_gain
 from symplearn.diagnosis._noisy import PathFit, fit_paths
 from symplearn.diagnosis._scan import on_path, scan
 from symplearn.diagnosis._score import Unit
 from symplearn.diagnosis._start import priors_without_effects
-from symplearn.diagnosis._strength import strength_gain
 from symplearn.diagnosis._trajectory import Stepper
 from symplearn.diagnosis._weighed import weigh_white
 

@@ -1,5 +1,6 @@
 """An effect's strength is of unknown order of magnitude: nothing is paid for being small, or for the unit."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -7,17 +8,10 @@ import pytest
 from posterior_cases import found, made, place
 from scipy import integrate, stats
 
-from symplearn.diagnosis import _mixture
+from symplearn.diagnosis import _magnitude, _mixture
+from symplearn.diagnosis._magnitude import strength_gain, strength_gains, turning_gain
 from symplearn.diagnosis._squares import log_product_of_squares
-from symplearn.diagnosis._strength import (
-    FAINT,
-    FAINT_WIDTHS,
-    WIDTHS,
-    mixture_gain,
-    mixture_gains,
-    strength_gain,
-    turning_gain,
-)
+from symplearn.diagnosis._strength import FAINT, FAINT_WIDTHS, WIDTHS, mixture_gain, mixture_gains
 
 NONE = -np.inf
 
@@ -182,6 +176,28 @@ def test_of_many_each_gains_what_it_gains_by_itself(lowest, alone):
         many = mixture_gains(*map(np.stack, zip(*some, strict=True)), own, bounds, alone)
         np.testing.assert_allclose(many, each, rtol=1e-12)  # round-off of other products
         assert (np.abs(many[:3]) > 0.01).all() and (many[3:] == 0.0).all()
+
+
+def test_combinations_side_by_side_gain_what_they_gain_alone(monkeypatch):
+    """Combinations of any effects, of one bound or number and of others, with a self-excitation, an unseen oscillator
+    or a wrong noise, gain together what each gains by itself; twice as many as are taken at once, too."""
+    monkeypatch.setattr(_magnitude, "_LANES", 2)
+    problem, rng = made(2), np.random.default_rng(8)
+    names = [("viscous_damping", "q1"), ("quadratic_drag", "q2"), ("sensor_gain", "b"), ("constant_force", "q1"),
+             ("self_excitation", "q2"), ("hidden_oscillator", "q1"), ("periodic_forcing", "q2"),
+             ("sensor_noise", "a")]  # fmt: skip
+    damping, drag, gain, push, activity, unseen, wave, noise = (place(problem, *name) for name in names)
+    some = [(), (noise,), (damping,), (drag,), (gain,), (damping, drag), (push, wave), (damping, activity), (activity,),
+            (damping, drag, gain), (drag, gain, push), (unseen, push), (damping, drag, gain, push)]  # fmt: skip
+    combinations, priors = [tuple(sorted(c)) for c in some], found(problem).priors
+    priors = replace(priors, precision=np.ones(problem.size))
+    z = [0.03 * (1.0 + rng.random(problem.size)) for _ in some]
+    roots = [0.01 * np.eye(problem.size) + 0.001 * rng.normal(size=(problem.size, problem.size)) for _ in some]
+    covariances = [root @ root.T for root in roots]
+    together = strength_gains(problem, combinations, priors, z, covariances)
+    each = zip(combinations, z, covariances, strict=True)
+    np.testing.assert_allclose(together, [strength_gain(problem, c, priors, *one) for c, *one in each], rtol=1e-12)
+    assert not together[:2].any() and (np.abs(together[2:]) > 0.01).all() and len(set(together[2:])) == len(some) - 2
 
 
 @pytest.mark.parametrize("sd", [1e-3, 0.01, 0.1])

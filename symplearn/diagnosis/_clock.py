@@ -21,7 +21,7 @@ from ._coloured import Colour
 from ._evidence import variance_inflation
 from ._problem import Problem
 from ._scatter import law_gain
-from ._weighed import Estimate, amplitudes_out, correlated, largest, trusting
+from ._weighed import Estimate, amplitudes_out, correlated, largest, of_any_strength, trusting
 
 # How often errors of sensor and clock are fitted, about the path that follows.
 _PASSES = 2
@@ -161,13 +161,13 @@ def _evidence(one: _Known) -> float:
 
 def _alone(lane: _Lane, both: Both) -> _Known:
     """Beside given errors of sensor and clock, and no curve."""
-    return _integrated(lane, _White.beside(lane, both), np.ones(lane.problem.channels))
+    (one,) = _integrated(lane, _White.beside(lane, both), [np.ones(lane.problem.channels)])
+    return one
 
 
 def _of_each_size(lane: _Lane, both: Both, noise: Float[np.ndarray, " channel"]) -> list[_Known]:
     """Beside the same and a curve of each size."""
-    white = _White.beside(lane, both)
-    return [_integrated(lane, white, size) for size in _sizes(lane, noise)]
+    return _integrated(lane, _White.beside(lane, both), _sizes(lane, noise))
 
 
 def _straight(lane: _Lane, begins: list[Both]) -> _Known:
@@ -186,7 +186,7 @@ def _curved(lane: _Lane, straight: _Known) -> list[Estimate]:
     best = int(np.argmax(list(map(_evidence, tried))))
     one = tried[best]
     both = _refitted(lane, one.estimate.z, one.amplitudes, [straight.white.both])
-    again = _integrated(lane, _White.beside(lane, both), _sizes(lane, straight.estimate.noise)[best])
+    (again,) = _integrated(lane, _White.beside(lane, both), [_sizes(lane, straight.estimate.noise)[best]])
     if again.estimate.log_evidence > one.estimate.log_evidence:
         tried[best] = again
     return [_told(lane, one) for one in tried]
@@ -215,8 +215,16 @@ def _refitted(
             for j, own in enumerate(lane.pieces)]  # fmt: skip
 
 
-def _integrated(lane: _Lane, white: _White, size: Float[np.ndarray, " channel"]) -> _Known:
-    """Unknowns and curves, whose shapes have together this root mean square, integrated beside given errors."""
+def _integrated(lane: _Lane, white: _White, sizes: Sequence[Float[np.ndarray, " channel"]]) -> list[_Known]:
+    """Unknowns and curves, whose shapes have together each of these root mean squares, integrated beside given
+    errors."""
+    each = [_of_size(lane, white, size) for size in sizes]
+    estimates = of_any_strength(lane.problem, lane.priors, [one.estimate for one in each])
+    return [replace(one, estimate=estimate) for one, estimate in zip(each, estimates, strict=True)]
+
+
+def _of_size(lane: _Lane, white: _White, size: Float[np.ndarray, " channel"]) -> _Known:
+    """The same of one size, all effects under their widest priors."""
     problem, fits, b = lane.problem, lane.fits, lane.b
     unit = size / np.sqrt(max(lane.curves, 1))
     grams, logs = zip(*(_gram(lane, j, white, unit[j]) for j in range(problem.channels)), strict=True)

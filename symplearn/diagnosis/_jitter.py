@@ -17,7 +17,7 @@ from ._clock_errors import rates
 from ._evidence import variance_inflation
 from ._problem import Problem
 from ._scatter import law_gain
-from ._weighed import Estimate, correlated, largest, trusting
+from ._weighed import Estimate, correlated, largest, of_any_strength, trusting
 
 # Variances of the error against the noise's that are tried, where the rate is its root mean square.
 _RATIOS = np.geomspace(0.02, 50.0, 12)
@@ -67,7 +67,7 @@ def weigh_jitter(problem: Problem, fits: Fits, priors: Priors, rows: Sequence[in
         scores = sum(x[1:] * e / noise for x, e, noise in zip(whole, left, one.noise, strict=True))
         out.append(replace(one, kind="jitter", log_evidence=value, jitters=tuple(ratios),
                            inflation=variance_inflation(scores.T)))  # fmt: skip
-    return out
+    return of_any_strength(problem, priors, out)
 
 
 def _channel(

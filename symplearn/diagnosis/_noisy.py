@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ._before import Before
 from ._calibrate import Priors, weights
 from ._evidence import Laplace
 from ._path import backward_lanes, forward_lanes, linearise
 from ._problem import Combination, Problem
 from ._stochastic import exposure, padded
 from ._trajectory import LANES, Stepper
-from ._weighed import under_priors
 
 # Steps towards a smaller or larger reading noise are lengthened this much: plain EM is slow where noise is small.
 _HASTE = 1.5
@@ -185,7 +185,7 @@ def _integrated(problem: Problem, fit: PathFit, passes, priors: Priors, weight) 
         sign[1:] = -1.0
         gram[np.ix_(place, place)] += g * np.outer(sign, sign)
         offset -= 0.5 * (float(logs) + (fit.used(r, weight[r]) > 0).sum() * np.log(2 * np.pi))
-    return under_priors(problem, fit.combination, gram, offset, fit.z, priors)
+    return Before.of(problem, fit.combination, priors).integrate(gram, offset, fit.z)
 
 
 def lane_grams(

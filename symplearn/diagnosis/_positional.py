@@ -21,7 +21,7 @@ from ._calibrate import Fits, Priors, residuals, weights
 from ._evidence import variance_inflation
 from ._problem import Problem
 from ._scatter import factor_evidence, law_gain
-from ._weighed import Estimate, amplitudes_out, correlated, largest
+from ._weighed import Estimate, amplitudes_out, correlated, largest, of_any_strength
 
 # Forms of an error that goes with what is read alone, and of one that goes with how that changes.
 _FORMS = ((Form.CURVE, Form.BENDS), (Form.CURVE, Form.BENDS, Form.PLAY))
@@ -105,12 +105,14 @@ def weigh_positional(
 
     Of a combination with a wrongly given noise, too: no such error is as rough as noise.
     """
-    out = []
-    for b in range(len(fits.combinations)):
-        ways = [_weighed(problem, fits, b, priors, rows, moving, each) for each in _FORMS[moving]]
+    forms, lanes, out = _FORMS[moving], range(len(fits.combinations)), []
+    every = [_weighed(problem, fits, b, priors, rows, moving, each) for b in lanes for each in forms]
+    every = of_any_strength(problem, priors, every)
+    for b in lanes:
+        ways = every[b * len(forms) : (b + 1) * len(forms)]
         values = np.nan_to_num([one.log_evidence for one in ways], nan=-np.inf, neginf=-np.inf)
         value = float(np.logaddexp.reduce(values)) - float(np.log(len(ways)))
-        told = int(values.argmax()) if form is None else _FORMS[moving].index(form)
+        told = int(values.argmax()) if form is None else forms.index(form)
         out.append(replace(ways[told], log_evidence=value))
     return out
 
@@ -118,7 +120,7 @@ def weigh_positional(
 def _weighed(
     problem: Problem, fits: Fits, b: int, priors: Priors, rows: Sequence[int], moving: bool, form: Form
 ) -> Estimate:
-    """The same by an error of one form."""
+    """The same by an error of one form, all effects under their widest priors."""
     combination, active = fits.combinations[b], problem.active(fits.combinations[b])
     known, precision = problem.noise_of(combination), priors.precision_of(problem, combination)
     channels = [_channel(problem, fits, b, rows, j, moving, form) for j in range(problem.channels)]

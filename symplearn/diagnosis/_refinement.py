@@ -12,13 +12,13 @@ from ._depths import along_the_depths
 from ._driven import as_driven
 from ._found import Found, speaker
 from ._gaps import across_gaps
+from ._magnitude import strength_entries
 from ._modes import along_the_modes
 from ._problem import Combination, Problem
 from ._prospects import MANY, Prospects
 from ._scan import ends, spacing
 from ._score import Start, inverse
 from ._sensors_beside import with_sensors
-from ._strength import strength_entries
 from ._weighed import Estimate
 from ._weigher import KEPT, Weigher
 

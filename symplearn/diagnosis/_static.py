@@ -24,7 +24,7 @@ from ._scan import layout
 from ._scatter import factor_evidence, law_gain
 from ._score import Unit, inverse
 from ._trajectory import Stepper
-from ._weighed import Estimate, amplitudes_out, correlated, standardised
+from ._weighed import Estimate, amplitudes_out, correlated, of_any_strength, standardised
 
 _FORCES = (*POWERS, *SHAPES)
 # Sizes that are tried: root mean squares that the force leaves in the readings, against their noise.
@@ -57,15 +57,16 @@ def weigh_static(stepper: Stepper, fits: Fits, priors: Priors, rows: Sequence[in
     problem, weight = stepper.problem, weights(stepper.problem, rows)
     r, out = residuals(problem, fits.predictions, weight), []
     for b, responses in enumerate(_responses(stepper, fits, rows)):
-        tried, errors = [], [x[b] for x in r]
+        pushes, errors = [], [x[b] for x in r]
         for one in responses:
             gram = _gram(problem, fits, b, errors, weight, one)
             unit = _noise_sized(problem, fits, b, gram, weight, priors)
             some = [_Push(one, _scaled(gram, problem, size * unit), size * unit) for size in _SIZES]
-            tried += [(_weighed(problem, fits, b, push, weight, priors), push) for push in some if push.is_finite]
+            pushes += [push for push in some if push.is_finite]
+        tried = of_any_strength(problem, priors, [_weighed(problem, fits, b, one, weight, priors) for one in pushes])
         if tried:
-            value = float(logsumexp([one.log_evidence for one, _ in tried]) - np.log(len(responses) * len(_SIZES)))
-            best, push = max(tried, key=lambda pair: pair[0].log_evidence)
+            value = float(logsumexp([one.log_evidence for one in tried]) - np.log(len(responses) * len(_SIZES)))
+            best, push = max(zip(tried, pushes, strict=True), key=lambda pair: pair[0].log_evidence)
             out.append(_told(problem, fits, b, replace(best, log_evidence=value), push, errors, weight))
     return out
 

@@ -14,29 +14,18 @@ not the likelier for what it could have been without being seen.
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.special import log_ndtr, logsumexp
+from scipy.special import log_ndtr
 
-from .._effects import EXCITATION
 from .._normal import log_density
-from ._activity import log_fed
-from ._calibrate import Priors
 from ._evidence import cut_off
 from ._mixture import over_choices, over_widest
-from ._problem import Combination, Problem
 from ._squares import log_product_of_squares
 
 # Widths of the mixture, and the narrowest of them in standard deviations of the estimate.
-WIDTHS, _SEEN = 7, 4.0
+WIDTHS, SEEN = 7, 4.0
 # The widths of an effect alone, and the narrowest of them in that of the widest: as the weakest missing force is to the
 # strongest that are tried.
 FAINT_WIDTHS, FAINT = 13, 1e-4
-# Standard deviation of the logarithm of where a self-excitation turns into a damping, about the size of the motion.
-_TURNING = np.log(2.0)
-# Nor is it far below: what turns at less than this share of that size, a quarter of the amplitude of a swing, drives
-# nothing that was recorded, and is a damping.
-_WITHIN = 0.4
-# The grid that integrates over it, in standard deviations of the estimate.
-_REACH, _POINTS = 5.0, 121
 # What the recording says of a direction is at least this share of what the prior says.
 _SILENT = 1e-9
 # Widths by the narrowest: evenly spread in their logarithm.
@@ -47,95 +36,12 @@ _ROUND_OFF = 1e-13
 _MANY = 16
 
 
-def strength_gain(
-    problem: Problem, combination: Combination, priors: Priors, z: Float[np.ndarray, " z"],
-    covariance: Float[np.ndarray, "z z"],
-) -> float:  # fmt: skip
-    """Log evidence under unknown orders of magnitude, less that under the widest priors, whose posterior is given; and
-    of a self-excitation what is fed in."""
-    total, blocks = log_fed(problem, combination, priors.powers, z, covariance), []
-    alone = sum(problem.candidate(member).effect.amplitudes > 0 for member in combination) == 1
-    seen = []
-    for member in combination:
-        entries = strength_entries(problem, combination, member)
-        if len(entries):
-            seen.append(_seen_share(problem, combination, priors, covariance, entries))
-        if problem.candidate(member).effect is EXCITATION:
-            total += turning_gain(
-                z[entries], covariance[np.ix_(entries, entries)], priors.scales[problem.candidate(member).values], alone
-            )
-        elif len(entries):
-            blocks.append(entries)
-    total += 0.0 if alone or not seen else float(np.log(max(seen)))
-    if not blocks:
-        return total
-    a, own = np.concatenate(blocks), np.repeat(np.arange(len(blocks)), [len(b) for b in blocks])
-    unit = priors.precision_of(problem, combination)[a] ** -0.5
-    centre = (z - priors.mean_of(problem, combination))[a] / unit
-    spread = covariance[np.ix_(a, a)] / np.outer(unit, unit)
-    bounds = problem.lower_bounds(combination)
-    lowest = np.array([bounds.get(int(k), -np.inf) for k in a]) / unit
-    return total + mixture_gain(centre, spread, own, lowest, alone)
-
-
-def _seen_share(
-    problem: Problem,
-    combination: Combination,
-    priors: Priors,
-    covariance: Float[np.ndarray, "z z"],
-    entries: Int[np.ndarray, " entry"],
-) -> float:
-    """Share of the prior of an effect that the recording shows."""
-    unit = priors.precision_of(problem, combination)[entries] ** -0.5
-    spread = covariance[np.ix_(entries, entries)] / np.outer(unit, unit)
-    if not np.isfinite(spread).all():
-        return 1.0
-    known = np.mean(np.maximum(1.0 / np.clip(np.linalg.eigvalsh(spread), 1e-300, None) - 1.0, 0.0))
-    return max(1.0 - faint_share(float(known) ** -0.5 if known > 0 else np.inf), 1.0 / FAINT_WIDTHS)
-
-
-def turning_gain(centre: np.ndarray, spread: np.ndarray, scales: np.ndarray, alone: bool = False) -> float:
-    """The same for a self-excitation c (1 - q^2/a^2) v, inside c v - e q^2 v, whose a is about where the motion is.
-
-    Of c and e each for itself, most would be dampings that grow with q^2 and drive nothing.
-    """
-    if not (np.isfinite(centre).all() and np.isfinite(spread).all()):
-        return 0.0
-    size = _widths(np.asarray(_SEEN * np.sqrt(spread[0, 0]) / scales[0]), alone)
-    values, vectors = np.linalg.eigh(spread)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))  # round-off may leave one below zero
-    grid = np.linspace(-_REACH, _REACH, _POINTS)
-    normal = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-    points = centre + normal @ root.T
-    inside = (points > 0).all(1)
-    if not inside.any():
-        return 0.0
-    c, e = points[inside].T
-    mass = log_density(normal[inside]).sum(1)
-    ratio = 0.5 * np.log(c / e * scales[1] / scales[0])
-    # Density of e given c: that of ln a, by |d ln a / d e| = 1 / (2 e).
-    turning = log_density(ratio, _TURNING) - log_ndtr(-np.log(_WITHIN) / _TURNING) - np.log(2 * e)
-    turning = np.where(ratio > np.log(_WITHIN), turning, -np.inf)
-    each = log_density(c[:, None], size * scales[0])
-    if not alone:
-        each = each + 2 * np.log(c[:, None] / (size * scales[0]))
-    strength = logsumexp(each, axis=1) - np.log(len(size))
-    wide = log_density(c, scales[0]) + log_density(e, scales[1]) + np.log(2.0)
-    return float(logsumexp(mass + turning + strength - wide) - logsumexp(mass))
-
-
-def strength_entries(problem: Problem, combination: Combination, member: int) -> Int[np.ndarray, " entry"]:
-    """Where in z the amplitudes of one member stand, and the start of what it adds unseen."""
-    place = dict(problem.placed(combination))[member]
-    amplitudes = np.arange(place.start, place.start + problem.candidate(member).effect.amplitudes)
-    return np.concatenate([amplitudes, problem.starts(member).ravel()])
-
-
 def mixture_gain(
     centre: Float[np.ndarray, " a"], spread: Float[np.ndarray, "a a"], own: np.ndarray, lowest: Float[np.ndarray, " a"],
     alone: bool = False,
 ) -> float:  # fmt: skip
-    """The same for a posterior in units of the widest priors, all of them about zero and of sd one.
+    """Log evidence under unknown orders of magnitude, less that under the widest priors: for a posterior in units of
+    these, all of them about zero and of sd one.
 
     **Arguments:** - `own`: the number of the effect that each entry belongs to. - `lowest`: bounds of the entries. -
     `alone`: whether an effect too weak to be seen counts.
@@ -185,16 +91,17 @@ def _shares(values: Float[np.ndarray, "lane b"], alone: bool) -> Float[np.ndarra
     """Widths of one effect's prior, in that of the widest, by the eigenvalues of what is known of it."""
     values = np.clip(values, 1e-300, None)
     information = np.mean(np.maximum(1.0 / values - 1.0, 0.0), axis=-1)
-    return _widths(_SEEN / np.sqrt(np.maximum(information, 1e-300)), alone)
+    return widths_from(SEEN / np.sqrt(np.maximum(information, 1e-300)), alone)
 
 
 def faint_share(sd: float) -> float:
     """Share of the prior of an effect alone that an estimate with this error, in units of the widest, does not show."""
-    return float(np.clip(np.log(_SEEN * max(sd, 1e-300) / FAINT) / -np.log(FAINT), 0.0, 1.0))
+    return float(np.clip(np.log(SEEN * max(sd, 1e-300) / FAINT) / -np.log(FAINT), 0.0, 1.0))
 
 
-def _widths(narrowest: Float[np.ndarray, "*lane"], alone: bool) -> Float[np.ndarray, "*lane width"]:
-    """All of them the widest where nothing is seen of any."""
+def widths_from(narrowest: Float[np.ndarray, "*lane"], alone: bool) -> Float[np.ndarray, "*lane width"]:
+    """Widths of an effect's prior in that of the widest, the narrowest given; all of them the widest where nothing is
+    seen of any."""
     if alone:
         return np.broadcast_to(_FAINT_ONES, (*np.shape(narrowest), FAINT_WIDTHS))
     return np.clip(narrowest, 1e-12, 1.0)[..., None] ** _SHRINKING

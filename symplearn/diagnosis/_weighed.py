@@ -1,17 +1,19 @@
 """One combination of effects with its evidence under each kind of remainder."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
 
+from ._before import Before
 from ._bend import Bend
 from ._calibrate import Fits, Priors, normal_equations, residuals, weights
 from ._coloured import Colour, fit_colour, whitened_gram, whitened_residuals, whitened_series
-from ._evidence import Laplace, laplace, variance_inflation
+from ._evidence import Laplace, variance_inflation
+from ._magnitude import strength_gains
 from ._problem import Combination, Problem
 from ._scatter import factor_evidence, law_gain
-from ._strength import strength_gain
 from ._trajectory import Stepper
 
 # A remainder of the sensor is smaller than this share of what it reads; else it is the signal.
@@ -86,11 +88,11 @@ def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -
     r = residuals(problem, fits.predictions, weight)
     square = sum((w * (x / fits.noise[:, None]) ** 2).sum((1, 2)) for w, x in zip(weight, r, strict=True))
     offset = _constant(weight, fits.noise)
-    out = []
+    out, led_to = [], []
     number = sum((w > 0).sum(0) for w in weight)
     for b, combination in enumerate(fits.combinations):
         gram = np.block([[np.full((1, 1), square[b]), vector[b][None]], [vector[b][:, None], matrix[b]]])
-        one = under_priors(problem, combination, gram, offset[b], fits.z[b], priors)
+        one = Before.of(problem, combination, priors).integrate(gram, offset[b], fits.z[b])
         scores = _scores(problem, fits, b, r, weight)
         # Errors as they are where the evidence is taken: after the step that a fit which is done is granted.
         taken = one.step if fits.converged[b] and not unearned(fits, b) else np.zeros(problem.size)
@@ -99,7 +101,7 @@ def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -
         errors = standardised(left, weight, fits.noise[b])
         value = _earned(one, fits, b) + law_gain(problem, combination, errors)
         value += factor_evidence(problem, combination, fits.noise[b], number)
-        value += strength_gain(problem, combination, priors, fits.z[b] + one.step, one.covariance)
+        led_to.append(fits.z[b] + one.step)
         out.append(
             Estimate(
                 combination,
@@ -114,7 +116,21 @@ def weigh_white(problem: Problem, fits: Fits, priors: Priors, rows: list[int]) -
                 unearned=unearned(fits, b),
             )  # fmt: skip
         )
-    return out
+    return of_any_strength(problem, priors, out, led_to)
+
+
+def of_any_strength(
+    problem: Problem, priors: Priors, estimates: Sequence[Estimate], z: Sequence[np.ndarray] | None = None
+) -> list[Estimate]:
+    """Estimates with what they gain where effects may be of any order of magnitude, about their own `z` or others."""
+    about = [one.z for one in estimates] if z is None else z
+    combinations, spreads = [one.combination for one in estimates], [one.covariance for one in estimates]
+    return _gained(estimates, strength_gains(problem, combinations, priors, about, spreads))
+
+
+def _gained(estimates: Sequence[Estimate], gains: Iterable[float]) -> list[Estimate]:
+    pairs = zip(estimates, gains, strict=True)
+    return [replace(one, log_evidence=one.log_evidence + float(gain)) for one, gain in pairs]
 
 
 def largest(problem: Problem, channel: int) -> float:
@@ -150,7 +166,7 @@ def weigh_coloured(problem: Problem, fits: Fits, priors: Priors, rows: list[int]
         mine = tuple(c[b] for c in chosen)
         one = correlated(problem, fits, b, grams[b], logs[b], number, sum(c.occam for c in mine), priors)
         out.append(replace(one, kind="coloured", colours=mine))
-    return _with_laws(problem, fits, out, r, weight)
+    return of_any_strength(problem, priors, _with_laws(problem, fits, out, r, weight))
 
 
 def _with_laws(problem: Problem, fits: Fits, estimates: list[Estimate], r, weight) -> list[Estimate]:
@@ -165,8 +181,8 @@ def _with_laws(problem: Problem, fits: Fits, estimates: list[Estimate], r, weigh
                   for j in range(problem.channels)]  # fmt: skip
         parts.append(np.where(w > 0, np.stack(series, axis=-1), np.nan))
     errors = np.concatenate(parts, axis=1)
-    gains = [law_gain(problem, one.combination, e / one.noise) for one, e in zip(estimates, errors, strict=True)]
-    return [replace(one, log_evidence=one.log_evidence + gain) for one, gain in zip(estimates, gains, strict=True)]
+    each = zip(estimates, errors, strict=True)
+    return _gained(estimates, [law_gain(problem, one.combination, e / one.noise) for one, e in each])
 
 
 def trusting(problem: Problem, fits: Fits) -> list[int]:
@@ -188,7 +204,8 @@ def _channel_gram(problem, fits: Fits, residual, weight, times, colours: list[Co
 def correlated(
     problem: Problem, fits: Fits, b: int, grams, logs, number: np.ndarray, occam: float, priors: Priors
 ) -> Estimate:  # fmt: skip
-    """Integrate the unknowns with each channel's white noise at its best value, found by alternation.
+    """Integrate the unknowns with each channel's white noise at its best value, found by alternation; all effects under
+    their widest priors.
 
     **Arguments:** - `grams`, `logs`: of each channel's whitened columns, in units of its white noise; those after the
     unknowns enter with amplitudes of unit variance. - `occam`: what the choice of the correlations owes.
@@ -197,24 +214,25 @@ def correlated(
     free = np.isnan(problem.noise_of(combination))
     fitted = int(problem.active(combination).sum()) + grams.shape[1] - 1 - problem.size
     least = np.where(number > fitted, 0.0, _LEAST) * noise
+    before = Before.of(problem, combination, priors)
     for _ in range(_TURNS):
         gram, follow, log = amplitudes_out((grams / (noise**2)[:, None, None]).sum(0), 1 + problem.size)
         offset = -0.5 * float((number * np.log(2 * np.pi * noise**2) + logs).sum() + log)
-        one = under_priors(problem, combination, gram, offset, fits.z[b], priors)
+        one = before.integrate(gram, offset, fits.z[b])
         z = fits.z[b] + one.step
         column = np.concatenate([[1.0], fits.z[b] - z])
         column = np.concatenate([column, -follow @ column])
         square = np.einsum("i,jik,k->j", column, grams, column)
-        before = noise
+        last = noise
         found = np.sqrt(np.maximum(square, 1e-300) / np.maximum(number, 1))
         noise = np.where(free, np.maximum(found, least), noise)
-        if (np.abs(noise - before) <= _SETTLED * before).all():
+        if (np.abs(noise - last) <= _SETTLED * last).all():
             break
     # A step may be too small for the numbers it is added to: where a trajectory is that sensitive it ran away, and what
     # the step would have gained is not there.
     lost = _misfit(gram, fits.z[b] - z) - _misfit(gram, -one.step)
     value = _earned(one, fits, b) - 0.5 * max(0.0, lost)
-    value += occam + strength_gain(problem, combination, priors, z, one.covariance)
+    value += occam
     if (square < 0).any():  # round-off of a trajectory that ran away
         value = -np.inf
     converged, promised = bool(fits.converged[b]), one.promised
@@ -251,17 +269,6 @@ def _earned(one: Laplace, fits: Fits, lane: int) -> float:
 def unearned(fits: Fits, lane: int) -> float:
     """Nats that one more step promises of a fit that has ended."""
     return 0.0 if fits.unearned is None else float(fits.unearned[lane])
-
-
-def under_priors(problem: Problem, combination: Combination, gram, offset: float, z, priors: Priors) -> Laplace:
-    """Laplace's integral of a combination from a Gram matrix of errors, by all that is known beforehand."""
-    if not np.isfinite(gram).all():
-        return Laplace(-np.inf, np.zeros(problem.size), np.zeros((problem.size, problem.size)), 0.0)
-    precision = priors.precision_of(problem, combination)
-    active, lower = problem.active(combination), problem.lower_bounds(combination)
-    bounds = priors.bounds_of(problem, combination)
-    one = laplace(gram, offset, z, priors.mean_of(problem, combination), precision, active, lower, bounds)
-    return replace(one, log_evidence=one.log_evidence + priors.log_size(problem, z))
 
 
 def standardised(r: list[np.ndarray], weight: list[np.ndarray], noise: np.ndarray) -> Float[np.ndarray, "row channel"]:

@@ -13,6 +13,7 @@ from ._clock import weigh_known_clock
 from ._coloured import Colour
 from ._found import Found
 from ._jitter import weigh_jitter
+from ._magnitude import strength_gain
 from ._noisy import PathFit, fit_paths
 from ._positional import weigh_positional
 from ._problem import USUAL, Combination, Problem
@@ -20,7 +21,6 @@ from ._scatter import law_gain, outlier_evidence, outliers, suspects
 from ._score import Start
 from ._start import windows
 from ._static import weigh_static
-from ._strength import strength_gain
 from ._trajectory import Stepper
 from ._weighed import Estimate, standardised, weigh_coloured, weigh_white
 
