@@ -121,7 +121,8 @@ def test_how_late_a_sensor_may_be_hangs_on_its_own_readings_and_on_the_motion(ev
     assert low < priors.upper[late.first] < high
 
 
-@pytest.mark.parametrize("is_driven", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["driven", "let go"])
+@pytest.mark.slow
+@pytest.mark.parametrize("is_driven", [True, False], ids=["driven", "let go"])
 def test_what_a_late_sensor_shows_of_the_time_before_is_left_out(is_driven):
     """Nobody knows what pushed a spring before its recording, nor how long a body was held that is let go: the delay
     is told alone, and that its first readings were left out."""

@@ -26,6 +26,7 @@ def answer(readings, holdout=0.25, restricted=("impulse", "viscous_damping", "co
     return diagnose(file, [cases.recorded(TIMES, readings)], options)
 
 
+@pytest.mark.slow
 def test_a_blow_in_held_out_rows_is_told_beside_the_answer():
     """Of a blow at 50.1 the rows up to 45 know nothing, and the verdict is of them; all rows show it, by far, and the
     sentence, the warning and the advice send the reader there."""

@@ -78,6 +78,7 @@ class Stopped(Exception):
     """A person stops the work, having read something."""
 
 
+@pytest.mark.slow
 def test_milliseconds_are_noticed_before_the_search():
     """Before the search, which takes many times as long as with seconds, a notice tells of milliseconds; none tells of
     seconds."""

@@ -67,6 +67,7 @@ def test_constants_are_ahead_by_no_more_than_they_follow_the_readings():
     assert constant_evidence(p, replace(bare, log_likelihood=best + 3.0)) == pytest.approx(-503.0, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_a_piece_of_the_motion_is_no_mismatch():
     """A tenth of a period, in a noise nearly as large as what is seen of it: consistent, though constants do as well,
     which is said."""
@@ -89,6 +90,7 @@ def pendulum(start):
     return file, [cases.recorded(TIMES, y)]
 
 
+@pytest.mark.slow
 def test_a_start_in_another_unit_is_no_agreement():
     """Degrees given as radians, so that the simulation has nothing in common with what was read: the verdict is
     `unexplained`, not a noise as large as the misfit, nor a sensor that shows nothing, and what to check is said."""
