@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from ._concealed_drawing import Public
 from ._concealed_effects import OUTSIDE, Effect
 from ._concealed_equivalent import equivalent
 from ._concealed_files import read_effects, read_setup
@@ -74,7 +73,7 @@ def consulted(answer: dict[str, Any], seen: tuple[np.ndarray, ...]) -> dict[str,
         "forecast": _forecast(best, answer),
         "rms": best.rms,
         **_naming(answer, seen, best),
-        "early": _naming(*early(answer, seen)),
+        "early": _naming(*early(answer, seen)),  # a diagnosis has no more to find names from
     }
 
 
@@ -104,8 +103,7 @@ def _naming(answer: dict[str, Any], seen: tuple[np.ndarray, ...], best: Fitted |
     truth, given, moving = _true(answer, seen)
     margins = noise_margins(answer, effects, seen)
     if moving:
-        public = read_setup(answer)[1]
-        margins |= _margins(answer, public, truth, given, best or _fitted(truth, given, moving), moving)
+        margins |= _margins(answer, truth, given, best or _fitted(truth, given, moving), moving)
     named = all(margins[m] > NOTHING for m in margins if m.startswith("nothing"))
     named &= all(margins[m] > OTHERS for m in margins if not m.startswith("nothing"))
     return {"margins": margins, "nameable": bool(named)}
@@ -140,11 +138,9 @@ def bic(found: Fitted) -> float:
     return found.chi2 + (len(form.open) + extra) * np.log(found.rows)
 
 
-def _margins(
-    answer: Any, public: Public, truth: Form, given: Given, best: Fitted, moving: tuple[Effect, ...]
-) -> dict[str, float]:
+def _margins(answer: Any, truth: Form, given: Given, best: Fitted, moving: tuple[Effect, ...]) -> dict[str, float]:
     """By how much each rival's BIC is above the truth's."""
-    rest = truth.effects[len(moving) :]
+    public, rest = read_setup(answer)[1], truth.effects[len(moving) :]
     own = bic(best)
     bare = form_of(truth.setup, public, rest)
     found = {"nothing": float(bic(_fitted(bare, given, ())) - own)}
@@ -203,8 +199,8 @@ def _cuts(seen: Sequence[np.ndarray]) -> list[int]:
 def _held_out(truth: Form, given: Given, seen: tuple[np.ndarray, ...], moving: Sequence[Effect]) -> float:
     """Rms error over the last quarter of a fit to the rest, in sd."""
     cut = _cuts(given.readings)
-    early = [np.where(np.arange(len(r))[:, None] < k, r, np.nan) for r, k in zip(given.readings, cut, strict=True)]
-    best = _fitted(truth, given._replace(readings=tuple(early)), moving, most=12)
+    fitted = [np.where(np.arange(len(r))[:, None] < k, r, np.nan) for r, k in zip(given.readings, cut, strict=True)]
+    best = _fitted(truth, given._replace(readings=tuple(fitted)), moving, most=12)
     found = truth.readings(best.theta[:, None])
     pairs = zip(found, seen, cut, strict=True)
     errors = np.concatenate([((f[k:, :, 0] - s[k:]) / given.sd) for f, s, k in pairs])

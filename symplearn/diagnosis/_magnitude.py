@@ -22,7 +22,8 @@ _TURNING = np.log(2.0)
 _WITHIN = 0.4
 # The grid that integrates over it, in standard deviations of the estimate.
 _REACH, _POINTS = 5.0, 121
-# Posteriors of like effects that are weighed at once: more would save nothing, and take memory.
+# Posteriors of like effects that are weighed at once. Of two effects each takes 0.66 ms by itself, 0.08 so, and 0.05
+# with 64; of three 1.5 ms, and from 4 on 0.7 to 1.1. Memory grows by a third of a megabyte with each.
 _LANES = 16
 
 
@@ -98,7 +99,7 @@ class _Strengths:
         return cls(members, turning, precision, mean, a, _Kind(own, lowest, alone))
 
     def apart(self, z: Float[np.ndarray, " z"], covariance: Float[np.ndarray, "z z"]) -> float:
-        """What is gained besides by the mixture of the others."""
+        """What is gained beside the mixture: by where a self-excitation turns, and by the share that is seen."""
         total = 0.0
         for entries, scales in self.turning:
             total += turning_gain(z[entries], covariance[np.ix_(entries, entries)], scales, self.kind.alone)
@@ -123,7 +124,8 @@ class _Strengths:
 
 
 def turning_gain(centre: np.ndarray, spread: np.ndarray, scales: np.ndarray, alone: bool = False) -> float:
-    """The same for a self-excitation c (1 - q^2/a^2) v, inside c v - e q^2 v, whose a is about where the motion is.
+    """What a self-excitation c (1 - q^2/a^2) v gains, inside c v - e q^2 v, where c is of any order of magnitude and a
+    is about where the motion is.
 
     Of c and e each for itself, most would be dampings that grow with q^2 and drive nothing.
     """
