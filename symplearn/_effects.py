@@ -75,6 +75,11 @@ class Effect:
     def is_dynamics(self) -> bool:
         return self.acts_on != COLUMN
 
+    @property
+    def swings(self) -> bool:
+        """Whether it swings by itself, at a frequency among its values."""
+        return "omega" in self.places
+
     def named(self, values: Values, origin: float) -> dict[str, Any]:
         """The contract's coefficients; `origin` is the time that phases inside are counted from."""
         return {name: values[..., k] for k, name in enumerate(self.coefficients)}

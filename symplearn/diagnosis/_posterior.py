@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from .._effects import GAIN, HIDDEN, REGIME, Memory, Oscillating
+from .._effects import GAIN, HIDDEN, REGIME, Memory
 from ._constant import constant_evidence
 from ._found import UNCONVERGED, Found, speaker
 from ._own_period import in_tune
@@ -232,7 +232,7 @@ def _informed(problem: Problem, found: Found, combination: Combination) -> bool:
         if one.effect is HIDDEN:  # how it swings may be seen where how strongly it is joined is not
             shown |= bool((sd[problem.starts(member)] < _UNINFORMED * found.priors.starts_of(one)).any())
         known &= shown and not (one.effect is GAIN and abs(1.0 + best.z[place.start]) < _DEAD)
-        if one.effect is HIDDEN or isinstance(one.effect, (Oscillating, Memory)):
+        if one.effect.swings or isinstance(one.effect, Memory):
             known &= bool(best.z[place.stop - 1] > found.priors.lower[one.values.stop - 1])
         if one.effect is REGIME:
             known &= _is_seen_before(problem, member, best.z[place.stop - 1])

@@ -171,8 +171,7 @@ class Problem:
 
     def swings(self, combination: Sequence[int]) -> bool:
         """Whether an effect swings by itself: what has a frequency, or an unseen oscillator."""
-        effects = {self.candidate(m).effect for m in combination}
-        return any(effect is HIDDEN or isinstance(effect, Oscillating) for effect in effects)
+        return any(self.candidate(m).effect.swings for m in combination)
 
     def is_steady(self, combination: Sequence[int]) -> bool:
         """Whether there is an effect, beside what is wrong with single readings, and none swings by itself."""

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import _effects as effects
-from .._effects import Candidate, Memory, Oscillating
+from .._effects import Candidate, Memory
 from ._arrow import MANY
 from ._calibrate import Fits, Priors, residuals, weights
 from ._noisy import PathFit, lane_grams
@@ -71,7 +71,7 @@ def _joined(windows: Float[np.ndarray, "recording 2"]) -> tuple[Float[np.ndarray
 
 
 def _places(one: Candidate, low: float, high: float, longest: float = np.inf) -> np.ndarray:
-    if isinstance(one.effect, Oscillating) or one.effect is effects.HIDDEN:
+    if one.effect.swings:
         step = spacing(one, low, high)
         number = int(min(_FREQUENCIES, np.ceil((high - low) / step)))
         # Evenly spaced as far as they go, which is what the span resolves; then ever wider.
@@ -86,7 +86,7 @@ def _places(one: Candidate, low: float, high: float, longest: float = np.inf) ->
 
 def spacing(one: Candidate, low: float, high: float) -> float:
     """About how far apart neighbouring frequencies or times are."""
-    if isinstance(one.effect, Oscillating) or one.effect is effects.HIDDEN:
+    if one.effect.swings:
         return _SPACING * low * (2 if one.effect is effects.HIDDEN else 1)
     return (high - low) / _TIMES
 

@@ -20,8 +20,6 @@ from ._score import Unit
 from ._stochastic import trajectories
 from ._trajectory import Stepper
 
-# Effects whose places are looked for here: at times, and at frequencies.
-_SUDDEN, _PERIODIC = (effects.IMPULSE, effects.REGIME), (effects.FORCING, effects.MODULATION, effects.HIDDEN)
 # Places kept for each effect and target, of all choices of recordings; times and frequencies that are looked at, and
 # how many of these together.
 _KEPT, _TIMES, _FREQUENCIES, _TOGETHER = 8, 400, 400, 80
@@ -115,7 +113,7 @@ class _Sums:
 def sharp_units(stepper: Stepper, fits: Fits, rows: Sequence[int], priors: Priors) -> dict[int, list[Unit]]:
     """The best times and frequencies about a fit, by effect and target; empty where it cannot be drawn back."""
     problem = stepper.problem
-    wanted = [c for c in problem.searched if problem.candidate(c).effect in _SUDDEN + _PERIODIC]
+    wanted = [c for c in problem.searched if (kind := problem.candidate(c).effect).swings or kind in effects.AT_ONCE]
     with np.errstate(all="ignore"):  # a trajectory that ran away is told by what is not finite
         recordings = _recordings(stepper, fits, rows, priors) if wanted else None
         if recordings is None:
@@ -127,8 +125,8 @@ def _best(problem: Problem, recordings: Sequence[_Recording], priors: Priors, ca
     """The best places of an effect and target, in all recordings or in some."""
     one = problem.equations.candidates[candidate]
     places = _places(problem, recordings, priors, candidate)
-    cut = range(0, len(places), _TOGETHER) if one.effect in _PERIODIC else (0,)
-    parts = [places[a : a + _TOGETHER] if one.effect in _PERIODIC else places for a in cut]
+    cut = range(0, len(places), _TOGETHER) if one.effect.swings else (0,)
+    parts = [places[a : a + _TOGETHER] if one.effect.swings else places for a in cut]
     alone = len(recordings) == 1
     sums = [_Sums.joined([_sums(problem, own, candidate, some, alone) for some in parts]) for own in recordings]
     scales = priors.scales[one.first : one.first + one.effect.amplitudes]
@@ -164,7 +162,7 @@ def _peaks(gains: Float[np.ndarray, " place"], places: Float[np.ndarray, " place
 
 def _places(problem: Problem, recordings: Sequence[_Recording], priors: Priors, candidate: int) -> np.ndarray:
     one = problem.equations.candidates[candidate]
-    if one.effect in _PERIODIC:
+    if one.effect.swings:
         low, high = ends(priors, one)
         number = int(np.ceil((high - low) / spacing(one, low, high))) + 1
         longest = max(float(np.ptp(own.times)) for own in recordings)
@@ -221,9 +219,8 @@ def _recordings(stepper: Stepper, fits: Fits, rows: Sequence[int], priors: Prior
     left = _left(problem, fits, rows, priors)
     if left is None:
         return None
-    steady = {
-        _steady(problem, c) for c in problem.searched if problem.candidate(c).effect in (effects.REGIME, *_PERIODIC)
-    }
+    ones = {c: problem.candidate(c).effect for c in problem.searched}
+    steady = {_steady(problem, c) for c, kind in ones.items() if kind.swings or kind is effects.REGIME}
     lanes = list(packed(problem, [Unit(c, None) for c in sorted(steady)]))
     laid = [layout(problem, units) for units in ([], *lanes)]
     paths, out = trajectories(stepper, fits.z[0], fits.combinations[0], rows), list[_Recording]()
