@@ -91,10 +91,17 @@ def needed(
     problem: Problem, recording: int, hots: Float[np.ndarray, "lane row coefficient"]
 ) -> Bool[np.ndarray, " switch"]:
     """Which switches lanes that are stepped together need, for what they have or what is known."""
-    on = (problem.terms[recording] != 0) | (hots != 0).any((0, 1))
-    on[problem.calibrated.place[problem.calibrated.parameters :]] = True
+    return np.any(needed_each(problem, recording, hots), axis=0)
+
+
+def needed_each(
+    problem: Problem, recording: int, hots: Float[np.ndarray, "lane row coefficient"]
+) -> Bool[np.ndarray, "lane switch"]:
+    """Which switches each lane needs."""
+    on = (problem.terms[recording] != 0) | (hots != 0).any(1)
+    on[:, problem.calibrated.place[problem.calibrated.parameters :]] = True
     own, always = _touched(problem.equations)
-    return (own & on).any(1) | always
+    return (own & on[:, None]).any(2) | always
 
 
 @lru_cache(maxsize=8)

@@ -61,6 +61,20 @@ class Rail:
         return [array.ctypes.data for array in self.arrays]
 
 
+@dataclass(frozen=True)
+class Blocks:
+    """What the machine takes and writes of lanes and of blocks of `WIDTH` directions, each of one of the `lanes`:
+    values of the start, the parameters and the coefficients, end to end, and their slopes."""
+
+    lanes: Int[np.ndarray, " block"]
+    values: Float[np.ndarray, "lane taken"]
+    switches: Bool[np.ndarray, "lane switch"]
+    slopes: Float[np.ndarray, "block taken direction"]
+    paths: Float[np.ndarray, "lane time state"] | None
+    out: Float[np.ndarray, "lane time shown"]
+    along: Float[np.ndarray, "block direction time shown"]
+
+
 @lru_cache(maxsize=4)
 def native_rows(equations: Equations, integrator: ig.AbstractIntegrator, known: int) -> "NativeRows | None":
     """The machine code of a simulation, written once; None where there is none, or the work is not a processor's.
@@ -86,24 +100,24 @@ class NativeRows:
         kinds = [ctypes.c_int64, ctypes.c_int64, *[ctypes.c_void_p] * POINTERS]
         self._run = ctypes.CFUNCTYPE(None, *kinds)(self._engine.get_function_address("rows"))
 
-    def __call__(
-        self, values: Float[np.ndarray, " taken"], slopes: Float[np.ndarray, "taken direction"], rail: Rail,
-        switches: Bool[np.ndarray, " switch"], path: Float[np.ndarray, "time state"] | None,
-        out: Float[np.ndarray, "time shown"], along: Float[np.ndarray, "direction time shown"],
-    ) -> None:  # fmt: skip
-        """Write the rows to `out` and `along`, from the values of the start, the parameters and the coefficients, end
-        to end, and their slopes.
+    def __call__(self, blocks: Blocks, some: Int[np.ndarray, " some"], rail: Rail) -> None:
+        """Write what some blocks show, and their slopes, along a recording's rows.
 
-        Phase points stand beside the readings; with a `path` they are those that arrive from its row before.
+        Phase points stand beside the readings; with paths they are those that arrive from a path's row before.
         """
-        arrays = values, slopes, switches, *(() if path is None else (path,)), out, along
-        assert all(array.flags.c_contiguous for array in arrays), "the machine reads what lies end to end"
-        at, stride = (
-            [array.ctypes.data for array in (values, slopes, switches, out, along)],
-            math.prod(rail.means.shape[1:]),
-        )
-        begun = None if path is None else path.ctypes.data
-        self._run(len(out), stride, *at[:2], *rail.places, at[2], begun, *at[3:])
+        lanes = blocks.lanes[some]
+        of_lanes = [_places(array, lanes) for array in (blocks.values, blocks.switches, blocks.out)]
+        begun = [None] * len(some) if blocks.paths is None else _places(blocks.paths, lanes)
+        of_blocks = [_places(array, some) for array in (blocks.slopes, blocks.along)]
+        rows, stride, given = blocks.out.shape[1], math.prod(rail.means.shape[1:]), rail.places
+        for values, on, out, path, slopes, along in zip(*of_lanes, begun, *of_blocks, strict=True):
+            self._run(rows, stride, values, slopes, *given, on, path, out, along)
+
+
+def _places(array: np.ndarray, some: Int[np.ndarray, " some"]) -> list[int]:
+    """Where some of an array's entries lie in memory."""
+    assert array.flags.c_contiguous, "the machine reads what lies end to end"
+    return (array.ctypes.data + array.strides[0] * some).tolist()
 
 
 def _traced(equations: Equations, integrator: ig.AbstractIntegrator, sizes: Sequence[int], known: int) -> ClosedJaxpr:

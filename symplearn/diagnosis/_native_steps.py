@@ -1,14 +1,13 @@
 """Trajectories with their sensitivities by machine code, lane by lane."""
 
 from collections.abc import Sequence
-from itertools import chain, islice
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from ._course import Course, needed
+from ._course import Course, needed_each
 from ._lanes import AbstractSteps, Found, Lanes, Threads
-from ._native_rows import WIDTH, NativeRows, Rail
+from ._native_rows import WIDTH, Blocks, NativeRows, Rail
 from ._problem import Problem
 
 # Substeps, each with the slopes of one register, that take as long as some ten tasks of a thread: two milliseconds.
@@ -31,39 +30,59 @@ class NativeSteps(AbstractSteps):
         return sum(int(rail.pieces.sum()) for rail in self.rails) < _LONG
 
     def __call__(self, problem: Problem, runs: Sequence[Lanes]) -> list[Found]:
-        work = [(problem, run, lane) for run in runs for lane in range(len(run.z))]
-        shares = np.array_split(np.arange(len(work)), self._threads(runs))
-        parts = self.threads.each(lambda some: [self._lane(*work[k]) for k in some], shares)
-        done, out = chain.from_iterable(parts), []
-        for run in runs:
-            shown, slopes = zip(*islice(done, len(run.z)), strict=True)
-            out.append(Found(np.stack(shown), slopes))
-        return out
+        laid, number = [self._laid(problem, run) for run in runs], self._threads(runs)
+        shares = [np.array_split(np.arange(len(run.z)), number) for run in runs]
+        for _ in self.threads.each(lambda some: self._step(runs, laid, some), list(zip(*shares, strict=True))):
+            pass  # it is written where it was laid out
+        return [Found(blocks.out, _slopes(run, blocks)) for run, blocks in zip(runs, laid, strict=True)]
 
     def _threads(self, runs: Sequence[Lanes]) -> int:
         """On how many threads runs are worth their handing over."""
         substeps = [int(self.rails[run.recording].pieces[: run.rows].sum()) for run in runs]
-        blocks = [sum(-(-len(places) // WIDTH) for places in run.along) for run in runs]
+        blocks = [sum(map(_blocks, run.along)) for run in runs]
         return self.threads.jobs if np.dot(substeps, blocks) > _WORTH else 1
 
-    def _lane(self, problem: Problem, run: Lanes, lane: int) -> tuple[np.ndarray, np.ndarray]:
-        """Readings and phase points of one lane, and their slopes."""
-        r, z, hot, places = run.recording, run.z[lane], run.hots[lane], run.along[lane]
-        known, links = self.links[r]
-        number, first = len(links), known.size - hot.shape[1]
-        values = known + z[:number] @ links
-        values[first:] += z[number:] @ hot[:-1] + hot[-1]
-        blocks, is_slot = -(-max(1, len(places)) // WIDTH), places >= number
-        free = np.zeros((blocks * WIDTH, known.size))
-        free[: len(places)][~is_slot] = links[places[~is_slot]]
-        free[: len(places), first:][is_slot] = hot[places[is_slot] - number]
-        slopes = np.ascontiguousarray(free.reshape(blocks, WIDTH, -1).transpose(0, 2, 1))
-        path = None if run.paths is None else np.ascontiguousarray(run.paths[lane], float)
-        out, along = np.empty((run.rows, self.native.shown)), np.empty((blocks * WIDTH, run.rows, self.native.shown))
-        switches = needed(problem, r, hot[None])
-        for k, block in enumerate(slopes):
-            self.native(values, block, self.rails[r], switches, path, out, along[k * WIDTH : (k + 1) * WIDTH])
-        return out, along[: len(places)]
+    def _laid(self, problem: Problem, run: Lanes) -> Blocks:
+        """What the machine takes for a run, and where it writes."""
+        known, links = self.links[run.recording]
+        number, first = len(links), known.size - run.hots.shape[2]
+        values = known + run.z[:, :number] @ links
+        values[:, first:] += (run.z[:, None, number:] @ run.hots[:, :-1])[:, 0] + run.hots[:, -1]
+        lanes = np.repeat(np.arange(len(run.z)), [_blocks(places) for places in run.along])
+        owners = np.repeat(np.arange(len(run.z)), [len(places) for places in run.along])
+        places, rows = np.concatenate(run.along), np.concatenate(_directions(run, lanes))
+        free, is_slot = np.zeros((len(lanes) * WIDTH, known.size)), places >= number
+        free[rows[~is_slot]] = links[places[~is_slot]]
+        free[rows[is_slot], first:] = run.hots[owners[is_slot], places[is_slot] - number]
+        slopes = np.ascontiguousarray(free.reshape(len(lanes), WIDTH, -1).transpose(0, 2, 1))
+        paths = None if run.paths is None else np.ascontiguousarray(run.paths, float)
+        shape, switches = (run.rows, self.native.shown), needed_each(problem, run.recording, run.hots)
+        return Blocks(lanes, values, switches, slopes, paths,
+                      np.empty((len(run.z), *shape)), np.empty((len(lanes), WIDTH, *shape)))  # fmt: skip
+
+    def _step(self, runs: Sequence[Lanes], laid: Sequence[Blocks], some: Sequence[Int[np.ndarray, " _"]]) -> None:
+        """Step some lanes of every run."""
+        for run, blocks, lanes in zip(runs, laid, some, strict=True):
+            if lanes.size:
+                own = np.arange(*np.searchsorted(blocks.lanes, [lanes[0], lanes[-1] + 1]))
+                self.native(blocks, own, self.rails[run.recording])
+
+
+def _blocks(places: Int[np.ndarray, " _"]) -> int:
+    """How many blocks a lane with slopes in so many entries has: one at least, which tells its readings."""
+    return -(-max(1, len(places)) // WIDTH)
+
+
+def _directions(run: Lanes, lanes: Int[np.ndarray, " block"]) -> list[Int[np.ndarray, " _"]]:
+    """By lane, which directions of all blocks are those of its slopes."""
+    first = np.searchsorted(lanes, np.arange(len(run.z))) * WIDTH
+    return [start + np.arange(len(places)) for start, places in zip(first, run.along, strict=True)]
+
+
+def _slopes(run: Lanes, blocks: Blocks) -> list[Float[np.ndarray, "_ time shown"]]:
+    """By lane the slopes in the entries that were named."""
+    along = blocks.along.reshape(-1, *blocks.along.shape[2:])
+    return [along[own[0] : own[-1] + 1] if own.size else along[:0] for own in _directions(run, blocks.lanes)]
 
 
 def run_natively(
@@ -76,10 +95,11 @@ def run_natively(
     values = known + unknowns @ links
     values[known.size - coefficients.size :] += coefficients
     rows = len(problem.rows[recording].times) - start
-    out, along = np.empty((rows, native.shown)), np.empty((WIDTH, rows, native.shown))
-    switches = needed(problem, recording, coefficients[None, None])
-    native(values, np.zeros((known.size, WIDTH)), Rail.of(course).since(start), switches, None, out, along)
-    return out
+    switches, one = needed_each(problem, recording, coefficients[None, None]), np.zeros(1, int)
+    out, along = np.empty((1, rows, native.shown)), np.empty((1, WIDTH, rows, native.shown))
+    blocks = Blocks(one, values[None], switches, np.zeros((1, known.size, WIDTH)), None, out, along)
+    native(blocks, one, Rail.of(course).since(start))
+    return out[0]
 
 
 def _link(course: Course, state: int) -> tuple[Float[np.ndarray, " taken"], Float[np.ndarray, "known taken"]]:

@@ -59,27 +59,30 @@ class Stepper:
     ) -> list[Predictions]:
         """Predictions by recording, over its first `rows[r]` rows."""
         p, alike = self.problem, self._alike(combinations)
-        some, runs = [combinations[k] for k in alike], []
+        some, kinds, runs = [combinations[k] for k in alike], set(combinations), []
         for r in range(len(self.courses)):
             local = p.local(r)
-            free = [np.nonzero(p.active(c)[local])[0] for c in some]
-            hots = np.stack([p.onehot(c, r) for c in some])
-            runs.append(Lanes(r, zs[alike][:, local], hots, free, rows[r]))
-        back = np.argsort(alike)
-        return [self._spread(run, found, back) for run, found in zip(runs, self.steps(p, runs), strict=True)]
+            free = {c: np.nonzero(p.active(c)[local])[0] for c in kinds}
+            hots = {c: p.onehot(c, r) for c in kinds}
+            by_lane = np.stack([hots[c] for c in some])
+            runs.append(Lanes(r, zs[alike][:, local], by_lane, [free[c] for c in some], rows[r]))
+        return [self._spread(run, found, alike) for run, found in zip(runs, self.steps(p, runs), strict=True)]
 
     def _alike(self, combinations: Sequence[Combination]) -> Int[np.ndarray, " lane"]:
         """Lanes in an order in which those of the same cost come together, by what acts and by how many directions."""
-        calls = [-(-int(self.problem.active(c).sum()) // DIRECTIONS) for c in combinations]
-        return np.lexsort((calls, [costly(self.problem, c) for c in combinations]))
+        p = self.problem
+        cost = {c: (-(-int(p.active(c).sum()) // DIRECTIONS), costly(p, c)) for c in set(combinations)}
+        return np.lexsort(np.array([cost[c] for c in combinations]).T)
 
     def _spread(self, run: Lanes, found: Found, order: Int[np.ndarray, " lane"]) -> Predictions:
-        """Predictions of lanes in an order."""
+        """Predictions of lanes that were stepped in an order, as they were given."""
         p = self.problem
+        shown = np.empty((len(run.z), run.rows, p.channels))
+        shown[order] = found.shown[..., : p.channels]
         slopes = np.zeros((len(run.z), run.z.shape[1], run.rows, p.channels))
-        for lane, (places, along) in enumerate(zip(run.along, found.slopes, strict=True)):
+        for lane, places, along in zip(order, run.along, found.slopes, strict=True):
             slopes[lane, places] = along[..., : p.channels]
-        return Predictions(found.shown[order, :, : p.channels], slopes[order])
+        return Predictions(shown, slopes)
 
     def ahead(self, work: Callable[[A], B], items: Sequence[A]) -> Iterator[B]:
         """The work on every item in order, on all threads while what comes before is being used; where stepping is
