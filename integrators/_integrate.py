@@ -75,6 +75,7 @@ def integrate(
     x0, ts = jnp.asarray(x0, dtype=float), jnp.asarray(ts, dtype=float)
     if x0.ndim != 1 or x0.shape[0] % 2 or x0.shape[0] == 0:
         raise ValueError(f"`x0` must be one phase point [q, p] of even length, but has shape {x0.shape}.")
+    _refuse_misfit(system, x0, "x0")
     if ts.ndim != 1 or ts.shape[0] == 0:
         raise ValueError(f"`ts` must be a row of one or more times, but has shape {ts.shape}.")
     _refuse_count(substeps)
@@ -87,10 +88,20 @@ def _refuse_count(substeps: Any) -> None:
         raise ValueError(f"`substeps` must be a whole number from 1 up, but is {substeps!r}.")
 
 
+def _refuse_misfit(system: System, x: Array, name: str) -> None:
+    """Refuse a phase point of another size than a system that tells its degrees of freedom, `dim`, is of."""
+    dim = getattr(system, "dim", None)
+    if isinstance(dim, int) and x.shape[:1] != (2 * dim,):
+        raise ValueError(
+            f"`{name}` must hold {2 * dim} numbers [q, p], since the system has {dim} degrees of freedom, but has "
+            f"shape {x.shape}."
+        )
+
+
 def propagate(
     system: System,
     integrator: AbstractIntegrator,
-    x: Float[Array, "two_d ..."],
+    x: ArrayLike | Sequence[float],
     t0: Time,
     t1: Time,
     substeps: int = 1,
@@ -100,8 +111,12 @@ def propagate(
     The propagator of a filter, not jitted. It lifts at each call, so over many calls a method of two copies,
     such as `Tao`, is no longer symplectic.
 
-    **Raises:** `ValueError` as `advance`.
+    **Arguments:** `x` - phase point [q, p], shape `(2d, ...)`; further axes are points side by side.
+
+    **Raises:** `ValueError` as `advance`, and where `x` is of another size than the system.
     """
+    x = jnp.asarray(x, dtype=float)
+    _refuse_misfit(system, x, "x")
     return integrator.project(advance(system, integrator, integrator.lift(x), t0, t1, substeps))
 
 

@@ -63,6 +63,9 @@ class EnergyDrift(eqx.Module):
     slope: Float[Array, ""]
     secular: Float[Array, ""]
 
+    def __str__(self) -> str:
+        return f"max |H - H_0| = {self.largest:.3g}, dH/dt = {self.slope:.3g}, over the duration {self.secular:.3g}"
+
 
 def energy_drift(trajectory: Trajectory) -> EnergyDrift:
     """The energy error of a trajectory, bounded or secular; of one point, none. NaN throughout where it diverged."""

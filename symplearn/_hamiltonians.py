@@ -252,6 +252,8 @@ def _terms(basis: AbstractBasis, names: list[str], degree: int) -> tuple[str, ..
 
 def _equation(left: str, constant: str, coefficients: Any, terms: tuple[str, ...]) -> str:
     numbers = np.asarray(getattr(coefficients, "value", coefficients))
+    if numbers.ndim > 1:  # of several systems side by side a line each
+        return "\n".join(_equation(left, constant, row, terms) for row in numbers)
     parts = [f"{number:+.6g} {term}" for number, term in zip(numbers, terms, strict=True) if number]
     return f"{left} = " + " ".join([constant, *parts] if constant else parts or ["0"])
 

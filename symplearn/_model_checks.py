@@ -46,14 +46,43 @@ def refuse_matrix(owner: str, name: str, given: Any, is_square: bool = False) ->
         raise InputError(f"`{owner}` needs a {needed} as its {name}, but was given the shape {shape}; give all rows.")
 
 
+def refuse_negative(owner: str, name: str, given: Any) -> None:
+    """Refuse, with `InputError`, a known number below 0, of which no root is real."""
+    if given is None or isinstance(given, eqx.Module | jax.core.Tracer):
+        return
+    least = np.min(np.asarray(given, dtype=float), initial=0.0)
+    if least < 0.0:
+        raise InputError(f"`{owner}` needs a {name} of at least 0, but was given {least:g}; correct its sign.")
+
+
+def refuse_indefinite(owner: str, name: str, given: Any) -> None:
+    """Refuse, with `InputError`, a matrix that is not symmetric, or gives some direction a variance below 0."""
+    refuse_asymmetric(owner, name, given)
+    matrix = _matrix(given)
+    if matrix is None or not np.isfinite(matrix).all():  # of these the filter says it
+        return
+    among = np.linalg.eigvalsh(matrix)
+    if np.any(among[..., 0] < -_ROUND_OFF * np.abs(among).max(-1)):
+        raise InputError(
+            f"`{owner}` needs a positive semi-definite {name}, but was given one whose least eigenvalue is "
+            f"{among.min():g}; correct a sign, or make what is off its diagonal smaller."
+        )
+
+
+def _matrix(given: Any) -> np.ndarray | None:
+    """What was given as an array; None where it is not known yet, or empty."""
+    given = _bare(given)
+    if given is None or isinstance(given, eqx.Module | jax.core.Tracer):
+        return None
+    matrix = np.asarray(given, dtype=float)
+    return matrix if matrix.size else None
+
+
 def refuse_asymmetric(owner: str, name: str, given: Any) -> None:
     """Refuse, with `InputError`, what is not square or not symmetric: of two triangles one would be ignored."""
     refuse_matrix(owner, name, given, is_square=True)
-    given = _bare(given)
-    if given is None or isinstance(given, eqx.Module | jax.core.Tracer):
-        return
-    matrix = np.asarray(given, dtype=float)
-    if matrix.size == 0:
+    matrix = _matrix(given)
+    if matrix is None:
         return
     # What is not a number is left to the filter, which says so.
     with np.errstate(invalid="ignore"):

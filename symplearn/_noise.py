@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ._counts import refuse_count
 from ._errors import InputError
-from ._model_checks import length_of, refuse_asymmetric, shape_of
+from ._model_checks import length_of, refuse_asymmetric, refuse_indefinite, refuse_negative, shape_of
 from ._parameters import AbstractKnown, number
 from ._small_products import product
 from ._transforms import Moments, with_noise
@@ -84,7 +84,7 @@ class AbstractCovariance(AbstractKnown):
 class ScaledIdentity(AbstractCovariance):
     """The covariance `variance` times the identity of size `dim`.
 
-    **Raises:** `InputError` where `dim` is no whole number of at least 1.
+    **Raises:** `InputError` where `dim` is no whole number of at least 1, or the variance is below 0.
     """
 
     variance: Any = eqx.field(converter=number)
@@ -92,6 +92,7 @@ class ScaledIdentity(AbstractCovariance):
 
     def __check_init__(self):
         refuse_count("ScaledIdentity", "dim", self.dim)
+        refuse_negative("ScaledIdentity", "variance", self.variance)
 
     @property
     def size(self) -> int | None:
@@ -109,7 +110,7 @@ class ScaledIdentity(AbstractCovariance):
 class Diagonal(AbstractCovariance):
     """The covariance with `variances` (dim,) on its diagonal.
 
-    **Raises:** `InputError` where the variances are no vector.
+    **Raises:** `InputError` where the variances are no vector, or one is below 0.
     """
 
     variances: Any = eqx.field(converter=number)
@@ -117,6 +118,7 @@ class Diagonal(AbstractCovariance):
     def __check_init__(self):
         if _shape_of(self.variances) == ():
             raise InputError("`Diagonal` needs a vector of variances, but was given one number; use `ScaledIdentity`.")
+        refuse_negative("Diagonal", "variances", self.variances)
 
     @property
     def size(self) -> int | None:
@@ -135,13 +137,13 @@ class Diagonal(AbstractCovariance):
 class Dense(AbstractCovariance):
     """A covariance (dim, dim), symmetric and positive semi-definite; `PositiveDefinite` learns one.
 
-    **Raises:** `InputError` where it is not square or not symmetric.
+    **Raises:** `InputError` where it is not square, not symmetric or not positive semi-definite.
     """
 
     covariance: Any = eqx.field(converter=number)
 
     def __check_init__(self):
-        refuse_asymmetric("Dense", "covariance", self.covariance)
+        refuse_indefinite("Dense", "covariance", self.covariance)
 
     @property
     def size(self) -> int | None:

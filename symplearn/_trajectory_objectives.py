@@ -151,12 +151,19 @@ class MultipleShooting(AbstractObjective):
     **Arguments:** `segments` - where they start; `continuity` - a prior on the gaps, none by default (see
     `fit_constrained` for gaps of exactly 0); `scores_first`.
 
-    **Raises:** `InputError` where the starts do not fit the segments, or cannot be read.
+    **Raises:** `InputError` where `segments` are none, or the starts do not fit them, or cannot be read.
     """
 
     segments: AbstractSegmentation
     continuity: AbstractContinuity = Unconstrained()
     scores_first: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        if not isinstance(self.segments, AbstractSegmentation):
+            raise InputError(
+                "`MultipleShooting` needs to be told where its segments start, by `EverySteps(length)` or "
+                f"`StartingAt(indices)`, but was given {self.segments!r}."
+            )
 
     def score(self, model: StateSpaceModel, series: TimeSeries) -> Float[Array, ""]:
         model, shots = self._shots(model, series)

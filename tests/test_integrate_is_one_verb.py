@@ -20,6 +20,18 @@ def unchecked(monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
+class Many(ig.AbstractSeparableHamiltonian):
+    """Oscillators that know how many they are."""
+
+    dim: int
+
+    def kinetic(self, p):
+        return 0.5 * p @ p
+
+    def potential(self, q):
+        return 0.5 * q @ q
+
+
 class Counted(ig.AbstractSeparableHamiltonian):
     """An oscillator that notes each trace of its potential. Its field has no converter: users forget it."""
 
@@ -168,6 +180,25 @@ def test_bad_arguments_get_one_clear_sentence(unchecked, x0, ts, substeps, messa
     """A wrong shape or count is refused with what was given and what is needed."""
     with pytest.raises(ValueError, match=message):
         ig.integrate(ig.problems.Pendulum(), ig.Leapfrog(), x0, ts, substeps)
+
+
+@pytest.mark.parametrize("size", [2, 6])
+@pytest.mark.parametrize("verb", ["integrate", "propagate"])
+def test_a_phase_point_is_of_the_system_s_size(unchecked, verb, size):
+    """A system that tells its degrees of freedom refuses a phase point of another size; a list is one, too."""
+    system, x0 = Many(2), [0.1] * size
+    times = (TS,) if verb == "integrate" else (0.0, 1.0)
+    with pytest.raises(ValueError, match=rf"must hold 4 numbers .* 2 degrees of freedom, but has shape \({size},\)"):
+        getattr(ig, verb)(system, ig.Leapfrog(), x0, *times)
+    end = ig.integrate(system, ig.Leapfrog(), [0.1] * 4, TS).xs[-1]
+    np.testing.assert_allclose(ig.propagate(system, ig.Leapfrog(), [0.1] * 4, 0.0, 1.0, len(TS) - 1), end, rtol=1e-12)
+
+
+def test_an_energy_drift_prints_its_numbers():
+    """What is printed are the largest error, its slope and what that adds up to: of a line of slope 2, both 2."""
+    ts, h = jnp.linspace(0.0, 1.0, 3), jnp.array([1.0, 2.0, 3.0])
+    path = ig.Trajectory(ts, jnp.zeros((3, 2)), h, jnp.asarray(True), jnp.asarray(np.inf))
+    assert str(ig.energy_drift(path)) == "max |H - H_0| = 2, dH/dt = 2, over the duration 2"
 
 
 def test_bad_methods_are_refused_at_construction():

@@ -76,3 +76,9 @@ def test_henon_heiles_is_a_polynomial_potential():
     zoo = ig.integrate(ig.problems.HenonHeiles(1.0), ig.Leapfrog(), x0, ts, substeps=20).xs
     # The same steps; only round-off, grown over 200 of them, differs.
     np.testing.assert_allclose(ours, zoo, atol=1e-12)
+
+
+def test_systems_side_by_side_print_a_line_each():
+    """Coefficients with a leading axis, as `vmap` takes them, print as the equations of their rows."""
+    rows = np.array([[1.0, 2.0], [0.0, -3.0]])
+    assert str(PolynomialPotential(1, 2, rows)) == "\n".join(str(PolynomialPotential(1, 2, row)) for row in rows)

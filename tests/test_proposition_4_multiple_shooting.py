@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -203,7 +204,7 @@ def test_failures_are_finite():
         assert np.all(np.isfinite(slope.initial.means.free)) and np.isfinite(float(slope.dynamics.system.gravity))
 
 
-def test_wrong_segments_are_one_clear_sentence():
+def test_wrong_segments_are_one_clear_sentence(monkeypatch):
     """What cannot be shot at is refused with what was given and what to do."""
     two, fours = SegmentStarts(jnp.zeros((2, 2))), MultipleShooting(EverySteps(4))
     with pytest.raises(InputError, match="cut into 3 segments, but the model's `initial` has 2"):
@@ -219,5 +220,9 @@ def test_wrong_segments_are_one_clear_sentence():
         segment_starts(pendulum(None), blind, EverySteps(4))
     with pytest.raises(InputError, match="at least 1"):
         EverySteps(0)
+    # The suite's type checker is off, as for a user: it would refuse the number before our sentence does.
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    with pytest.raises(InputError, match=r"`EverySteps\(length\)` or .* was given 10"):
+        MultipleShooting(10)
     with pytest.raises(ValueError, match="increasing indices from 0"):
         StartingAt((0, 4, 4))
