@@ -155,6 +155,7 @@ def document():
         "all_rows": None,
         "thinning": {"rows": 800, "used": 800},
         "converged": True,
+        "complete": True,
         "version": "0.1.0",
         "seed": 0,
         "seconds": 24.8123,

@@ -196,13 +196,14 @@ def test_unexplained_names_nothing():
     assert "process noise alone) (reported)" in text_of(page, "remains")
 
 
-def test_a_fit_that_did_not_converge_is_said_first(tmp_path):
-    """Neither page nor terminal shows a failed fit as a success."""
-    answer = cases.document() | {"converged": False}
+@pytest.mark.parametrize(("key", "said"), [("converged", "did not converge"), ("complete", "cut short")])
+def test_what_is_not_to_be_relied_on_is_said_first(key, said, tmp_path):
+    """Neither page nor terminal shows a failed fit, or a search that was cut short, as a success."""
+    answer = cases.document() | {key: False}
     record = cases.damped_pendulum(document=answer, series=())
     page = html_report(record)
-    assert page.index("did not converge") < page.index('<section id="where">')
-    assert "did not converge" in printed(record, tmp_path).splitlines()[1]
+    assert page.index(said) < page.index('<section id="where">')
+    assert said in printed(record, tmp_path).splitlines()[1]
 
 
 def test_every_coefficient_of_a_finding_has_its_row():

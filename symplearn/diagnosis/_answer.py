@@ -1,5 +1,6 @@
 """Everything that is said about a finished search."""
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -97,16 +98,17 @@ class Answer:
             return self._outlooks(estimate)
         return [Outlook(self.stepper, estimate, r, self.pull.intensity) for r in range(len(self.problem.rows))]
 
-    def diagnosis(self, seconds: float) -> Diagnosis:
+    def diagnosis(self, begin: float) -> Diagnosis:
+        """The whole answer to what was asked at a time of the monotonic clock."""
         f, eq = self.file, self.problem.equations
         forces = {p: e.text for p, e in f.forces.items()}
         readings = {c: e.text for c, e in f.recording.observe.items()}
         lines = (f.coordinates, f.momenta, eq.columns, f.hamiltonian.text, forces, readings)
         calibrated = augmented(f, self.problem, self.found.priors, self.before, {}, {}, {})
-        whole = self._whole()
+        whole, ahead = self._whole(), self.forecast
         return Diagnosis(
             title=f.title,
-            document=self._document(seconds),
+            document=self._document(time.monotonic() - begin),
             columns=eq.columns,
             coordinates=f.coordinates,
             units=f.units,
@@ -114,7 +116,7 @@ class Answer:
             equation_after=equation_lines(*lines, stated(whole.terms)),
             series=tuple(self._series(r) for r in range(len(self.recordings))),
             augmented=whole,
-            forecast=self.forecast,
+            forecast=ahead,
         )
 
     def _whole(self) -> SimulationFile:
@@ -176,6 +178,7 @@ class Answer:
                 "used": sum(r.used for r in self.problem.rows),
             },
             "converged": bool(self.after.converged and all(o.ok and np.isfinite(o.readings).all() for o in self.with_)),
+            "complete": self.found.complete,
             "version": VERSION,
             "seed": self.options.seed,
             "seconds": round(seconds, 2),
@@ -358,6 +361,7 @@ class Answer:
         """Readings to come, where they were asked for."""
         if self.times is None:
             return None
+        self.options.progress("forecasting")
         # What is missing was a force to the simulation as it is; one that errs by its sensor's memory alone claims to
         # know how it goes on.
         before = self.pull or self.before if self.chosen else self.before

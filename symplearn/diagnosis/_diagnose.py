@@ -65,7 +65,7 @@ def _diagnosed(file: SimulationFile, recordings: Sequence[Recording], options: O
     found, stepper, told, all_rows = searched(file, recordings, options, begin + options.time_limit)
     options.progress("comparing before and after on the held-out rows")
     answer = Answer(file, recordings, stepper, found, options, times, [*told, *notes], all_rows)
-    return answer.diagnosis(time.monotonic() - begin)
+    return answer.diagnosis(begin)
 
 
 def _times_ahead(file: SimulationFile, recording: Recording, options: Options) -> np.ndarray | None:

@@ -13,7 +13,7 @@ from ..diagnosis._record import Diagnosis
 from ._equation import equation_pairs
 from ._figures import not_drawn, plates
 from ._units import coefficient_unit
-from ._verdict import PROBLEM, verdict_sentence, where_and_when
+from ._verdict import caution, verdict_sentence, where_and_when
 from ._words import DASH, combination, effect, estimate, interval, number, plain, probability, ratio, targets
 
 
@@ -26,7 +26,7 @@ def html_report(diagnosis: Diagnosis) -> str:
         document=document,
         changed=changed,
         verdict=verdict_sentence(diagnosis),
-        problem=None if document["converged"] else PROBLEM,
+        problem=caution(document),
         location=where_and_when(diagnosis),
         held_back=combination(all_rows["likeliest"]["findings"], unexplained=True) if all_rows else None,
         findings=[_finding(finding, diagnosis) for finding in document["findings"]],

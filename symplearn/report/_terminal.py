@@ -5,7 +5,7 @@ from pathlib import Path
 from rich.text import Text
 
 from ..diagnosis._record import Diagnosis
-from ._verdict import PROBLEM, verdict_sentence
+from ._verdict import caution, verdict_sentence
 from ._words import number, plain, ratio
 
 _COLOURS = {"consistent": "bold green", "mismatch": "bold yellow", "unexplained": "bold red"}
@@ -20,8 +20,8 @@ def summary(diagnosis: Diagnosis, directory: Path) -> Text:
     document, text = diagnosis.document, Text()
     colour = _COLOURS["mismatch" if document["all_rows"] else document["verdict"]]
     text.append(verdict_sentence(diagnosis) + "\n", style=colour)
-    if not document["converged"]:
-        text.append(PROBLEM + "\n", style="bold red")
+    if careful := caution(document):
+        text.append(careful + "\n", style="bold red")
     text.append(f"Where: {plain(document['location']['where'])}\n")
     for finding in document["findings"]:
         text.append(f"  * {plain(finding['sentence'])}\n")

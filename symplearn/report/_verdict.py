@@ -1,5 +1,6 @@
 """The verdict, its place and its times in plain sentences."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from ..diagnosis._law_text import moment
@@ -7,7 +8,14 @@ from ..diagnosis._record import Diagnosis
 from ._units import time_unit
 from ._words import combination, plain, probability, takes_back
 
-PROBLEM = "The fit did not converge: the numbers here are where it stopped, not an answer to rely on."
+_CUT_SHORT = "The search was cut short by the time limit: what it did not come to may be likelier than what is told."
+_PROBLEM = "The fit did not converge: the numbers here are where it stopped, not an answer to rely on."
+
+
+def caution(document: Mapping[str, Any]) -> str:
+    """What keeps an answer from being one to rely on; empty where nothing does."""
+    cut, problem = not document["complete"], not document["converged"]
+    return " ".join([_CUT_SHORT] * cut + [_PROBLEM] * problem)
 
 
 def verdict_sentence(diagnosis: Diagnosis) -> str:
