@@ -17,12 +17,13 @@ from .._rows import known_inputs, past_of, spans_between
 from .._triangular import semidefinite_cholesky
 from ._bend import bent
 from ._course import effect_coefficients, model_at
+from ._lanes import Lanes
 from ._lasting import colour_ratio, total_noise
 from ._outlook import intensity_of
 from ._problem import Problem
 from ._reach import covariance_within_reach
 from ._record import Forecast
-from ._stochastic import exposure, filter_lane, padded, row_roots, run_lane, softness
+from ._stochastic import exposure, filter_lane, padded, row_roots, softness
 from ._taught import root_of, taught
 from ._trajectory import Stepper
 from ._weighed import Estimate
@@ -114,10 +115,12 @@ def _by_all_rows(
     """Draws given all rows, their phase points at the last one, and log weights; the first is the most probable one."""
     problem, rows = stepper.problem, stepper.problem.rows[0]
     known = taught(stepper, e, root)
-    zs = jnp.asarray(_within(problem, known.mean + units @ known.root.T, known.root))
-    seen, states = _run_through(*_model(stepper), zs, jnp.asarray(problem.onehot(e.combination, 0)))
-    shown = bent(np.asarray(seen)[:, : len(rows.times)], rows.times, e.bends)
-    return zs, states[:, len(rows.times) - 1], known.log_weights(units, shown, rows.readings)
+    zs = _within(problem, known.mean + units @ known.root.T, known.root)
+    hots, nowhere = np.stack([problem.onehot(e.combination, 0)] * len(zs)), [np.zeros(0, int)] * len(zs)
+    (found,) = stepper.steps(problem, [Lanes(0, zs, hots, nowhere, len(rows.times))])
+    seen, states = np.split(found.shown, [problem.channels], axis=2)
+    log_weights = known.log_weights(units, bent(seen, rows.times, e.bends), rows.readings)
+    return jnp.asarray(zs), jnp.asarray(states[:, -1]), log_weights
 
 
 def _filtered(stepper: Stepper, e: Estimate, zs: Array, key: Array) -> Array:
@@ -186,18 +189,6 @@ def _within(
     part = slice(problem.state, problem.state + c.size)
     zs[:, part] = np.clip(zs[:, part], c.lower, c.upper)  # what follows one may leave its own
     return zs
-
-
-@eqx.filter_jit
-def _run_through(equations: Any, integrator: Any, course: Any, zs: Array, onehot: Array) -> tuple[Array, Array]:
-    """Readings (draw, time, channel) and phase points of trajectories that no force disturbs."""
-    state, f = 2 * equations.width, course.to_parameters.shape[0]
-
-    def one(z: Array) -> tuple[Array, Array]:
-        coefficients = effect_coefficients(z[state + f :], onehot)
-        return run_lane(equations, integrator, course, z[state : state + f], coefficients, z[:state], 0)
-
-    return jax.lax.map(one, zs, batch_size=16)
 
 
 @eqx.filter_jit
