@@ -14,7 +14,7 @@ import integrators as ig
 
 from ._counts import refuse_count
 from ._errors import InputError
-from ._model_checks import length_of, refuse_indefinite, refuse_matrix, refuse_misfit, shape_of
+from ._model_checks import length_of, refuse_asymmetric, refuse_matrix, refuse_misfit, shape_of
 from ._noise import AdditiveGaussian, WienerIncrement, enter
 from ._parameters import AbstractKnown, number
 from ._small_products import product
@@ -27,15 +27,14 @@ class Gaussian(AbstractKnown):
 
     Bare arrays are known; `Gaussian(Learnt(mean), covariance)` learns the mean.
 
-    **Raises:** `InputError` where the covariance is not square, not symmetric or not positive semi-definite, or not
-    of the mean's length.
+    **Raises:** `InputError` where the covariance is not square, not symmetric, or not of the mean's length.
     """
 
     mean: Any = eqx.field(converter=number)
     covariance: Any = eqx.field(converter=number)
 
     def __check_init__(self):
-        refuse_indefinite("Gaussian", "covariance", self.covariance)
+        refuse_asymmetric("Gaussian", "covariance", self.covariance)
         mean, covariance = shape_of(self.mean), shape_of(self.covariance)
         if mean is not None and covariance is not None and mean != covariance[:-1]:
             raise InputError(

@@ -55,20 +55,6 @@ def refuse_negative(owner: str, name: str, given: Any) -> None:
         raise InputError(f"`{owner}` needs a {name} of at least 0, but was given {least:g}; correct its sign.")
 
 
-def refuse_indefinite(owner: str, name: str, given: Any) -> None:
-    """Refuse, with `InputError`, a matrix that is not symmetric, or gives some direction a variance below 0."""
-    refuse_asymmetric(owner, name, given)
-    matrix = _matrix(given)
-    if matrix is None or not np.isfinite(matrix).all():  # of these the filter says it
-        return
-    among = np.linalg.eigvalsh(matrix)
-    if np.any(among[..., 0] < -_ROUND_OFF * np.abs(among).max(-1)):
-        raise InputError(
-            f"`{owner}` needs a positive semi-definite {name}, but was given one whose least eigenvalue is "
-            f"{among.min():g}; correct a sign, or make what is off its diagonal smaller."
-        )
-
-
 def _matrix(given: Any) -> np.ndarray | None:
     """What was given as an array; None where it is not known yet, or empty."""
     given = _bare(given)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ._counts import refuse_count
 from ._errors import InputError
-from ._model_checks import length_of, refuse_asymmetric, refuse_indefinite, refuse_negative, shape_of
+from ._model_checks import length_of, refuse_asymmetric, refuse_negative, shape_of
 from ._parameters import AbstractKnown, number
 from ._small_products import product
 from ._transforms import Moments, with_noise
@@ -137,13 +137,13 @@ class Diagonal(AbstractCovariance):
 class Dense(AbstractCovariance):
     """A covariance (dim, dim), symmetric and positive semi-definite; `PositiveDefinite` learns one.
 
-    **Raises:** `InputError` where it is not square, not symmetric or not positive semi-definite.
+    **Raises:** `InputError` where it is not square or not symmetric.
     """
 
     covariance: Any = eqx.field(converter=number)
 
     def __check_init__(self):
-        refuse_indefinite("Dense", "covariance", self.covariance)
+        refuse_asymmetric("Dense", "covariance", self.covariance)
 
     @property
     def size(self) -> int | None:
