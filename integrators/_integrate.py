@@ -115,7 +115,7 @@ def propagate(
 
     **Raises:** `ValueError` as `advance`, and where `x` is of another size than the system.
     """
-    x = jnp.asarray(x, dtype=float)
+    x = jnp.asarray(x)
     _refuse_misfit(system, x, "x")
     return integrator.project(advance(system, integrator, integrator.lift(x), t0, t1, substeps))
 

@@ -46,8 +46,8 @@ def forecast(estimate: Estimate, *, until: float | None = None, times: Any = Non
 
     The state is stepped through the data's times, multiples of the recording's last interval after its end, whatever
     `times` are. Noise that belongs to a data interval, as `AdditiveGaussian`, enters there; a `WienerIncrement` enters
-    everywhere. Means and standard deviations are pushed forward, as the filter's are; where they grow as wide as the
-    motion itself, between two wells, they are of no motion: `stochastic_forecast` draws motions instead.
+    everywhere. Means and standard deviations are pushed forward, as the filter's are, and say nothing once they are as
+    wide as the motion itself, as soon happens between two wells; `stochastic_forecast` draws motions instead.
 
     **Arguments:** give one of `until` - the last time, in steps of the recording's last interval; `times` -
     increasing times after the recording's last; and, of a driven model, `inputs` (time + 1, input), held from the

@@ -55,20 +55,14 @@ def refuse_negative(owner: str, name: str, given: Any) -> None:
         raise InputError(f"`{owner}` needs a {name} of at least 0, but was given {least:g}; correct its sign.")
 
 
-def _matrix(given: Any) -> np.ndarray | None:
-    """What was given as an array; None where it is not known yet, or empty."""
-    given = _bare(given)
-    if given is None or isinstance(given, eqx.Module | jax.core.Tracer):
-        return None
-    matrix = np.asarray(given, dtype=float)
-    return matrix if matrix.size else None
-
-
 def refuse_asymmetric(owner: str, name: str, given: Any) -> None:
     """Refuse, with `InputError`, what is not square or not symmetric: of two triangles one would be ignored."""
     refuse_matrix(owner, name, given, is_square=True)
-    matrix = _matrix(given)
-    if matrix is None:
+    given = _bare(given)
+    if given is None or isinstance(given, eqx.Module | jax.core.Tracer):
+        return
+    matrix = np.asarray(given, dtype=float)
+    if matrix.size == 0:
         return
     # What is not a number is left to the filter, which says so.
     with np.errstate(invalid="ignore"):

@@ -2,6 +2,7 @@
 
 import itertools
 import re
+import time
 from functools import partial
 
 import engine_cases as cases
@@ -12,6 +13,10 @@ from symplearn._inputs import Inputs
 from symplearn._progress import Progress
 from symplearn.diagnosis import Options, diagnose
 from symplearn.diagnosis._build import Restriction
+from symplearn.diagnosis._found import Found
+from symplearn.diagnosis._other_units import in_other_units
+from symplearn.diagnosis._start import priors_without_effects
+from symplearn.diagnosis._trajectory import Stepper
 
 TIMES = np.linspace(0.0, 8.0, 160)
 # What the files say is wrong whatever is searched; two effects are a quick search, one of them with a body of its own.
@@ -138,6 +143,16 @@ def test_an_input_that_pushes_the_other_way_is_told(tilt, said):
 
 def pushed(torque, _, x):
     return [x[1], -20 * np.sin(x[0]) + torque]
+
+
+@pytest.mark.parametrize(("left", "said"), [(np.inf, ["with y0 divided by 57.3"]), (-1.0, [])])
+def test_no_unit_is_tried_once_time_has_run_out(left, said):
+    """Conversions take as long as a search where starts are hard to find: the time limit holds for them, too."""
+    recordings = [cases.recorded(TIMES, np.degrees(swing()))]
+    problem = cases.problem(PENDULUM, recordings, 0.05)
+    found = Found(problem, priors_without_effects(problem))  # nothing was weighed: nothing follows the recording
+    warnings = in_other_units(PENDULUM, recordings, Stepper(problem), found, Options(), time.monotonic() + left)
+    assert [one[: len(start)] for one, start in zip(warnings, said, strict=True)] == said
 
 
 def test_no_unit_is_tried_for_a_column_of_hardly_more_than_noise():

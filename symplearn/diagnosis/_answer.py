@@ -105,7 +105,7 @@ class Answer:
         readings = {c: e.text for c, e in f.recording.observe.items()}
         lines = (f.coordinates, f.momenta, eq.columns, f.hamiltonian.text, forces, readings)
         calibrated = augmented(f, self.problem, self.found.priors, self.before, {}, {}, {})
-        whole, ahead = self._whole(), self.forecast
+        whole, ahead = self._whole(), self.forecast  # before the clock is read: it is part of the work
         return Diagnosis(
             title=f.title,
             document=self._document(time.monotonic() - begin),

@@ -74,7 +74,7 @@ def searched(
     options.progress("comparing how well answers predict ahead")
     look_ahead(search.stepper, found, search.rows)
     found.is_fine = steps[1]
-    units = units or in_other_units(file, given, search.stepper, found, options)
+    units = units or in_other_units(file, given, search.stepper, found, options, deadline)
     told = [*units, *left_out(search.problem, found, given, recordings)]
     return found, search.stepper, told, _with_all_rows(laid, search, steps[0], options, deadline)
 

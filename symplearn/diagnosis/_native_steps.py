@@ -48,9 +48,10 @@ class NativeSteps(AbstractSteps):
         number, first = len(links), known.size - run.hots.shape[2]
         values = known + run.z[:, :number] @ links
         values[:, first:] += (run.z[:, None, number:] @ run.hots[:, :-1])[:, 0] + run.hots[:, -1]
-        lanes = np.repeat(np.arange(len(run.z)), [_blocks(places) for places in run.along])
-        owners = np.repeat(np.arange(len(run.z)), [len(places) for places in run.along])
-        places, rows = np.concatenate(run.along), np.concatenate(_directions(run, lanes))
+        counts = [len(places) for places in run.along]
+        lanes, owners = (np.repeat(np.arange(len(run.z)), each) for each in (list(map(_blocks, run.along)), counts))
+        places = np.concatenate(run.along)
+        rows = np.arange(len(places)) + np.repeat(_begins(lanes, len(run.z)) - np.cumsum([0, *counts[:-1]]), counts)
         free, is_slot = np.zeros((len(lanes) * WIDTH, known.size)), places >= number
         free[rows[~is_slot]] = links[places[~is_slot]]
         free[rows[is_slot], first:] = run.hots[owners[is_slot], places[is_slot] - number]
@@ -73,16 +74,15 @@ def _blocks(places: Int[np.ndarray, " _"]) -> int:
     return -(-max(1, len(places)) // WIDTH)
 
 
-def _directions(run: Lanes, lanes: Int[np.ndarray, " block"]) -> list[Int[np.ndarray, " _"]]:
-    """By lane, which directions of all blocks are those of its slopes."""
-    first = np.searchsorted(lanes, np.arange(len(run.z))) * WIDTH
-    return [start + np.arange(len(places)) for start, places in zip(first, run.along, strict=True)]
+def _begins(lanes: Int[np.ndarray, " block"], number: int) -> Int[np.ndarray, " lane"]:
+    """Which of the directions of all blocks is the first of every lane."""
+    return np.searchsorted(lanes, np.arange(number)) * WIDTH
 
 
 def _slopes(run: Lanes, blocks: Blocks) -> list[Float[np.ndarray, "_ time shown"]]:
     """By lane the slopes in the entries that were named."""
-    along = blocks.along.reshape(-1, *blocks.along.shape[2:])
-    return [along[own[0] : own[-1] + 1] if own.size else along[:0] for own in _directions(run, blocks.lanes)]
+    along, begins = blocks.along.reshape(-1, *blocks.along.shape[2:]), _begins(blocks.lanes, len(run.z))
+    return [along[begin : begin + len(places)] for begin, places in zip(begins, run.along, strict=True)]
 
 
 def run_natively(

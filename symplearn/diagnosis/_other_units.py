@@ -79,8 +79,9 @@ def in_another_time(
 
 
 def in_other_units(
-    file: SimulationFile, recordings: Sequence[Recording], stepper: Stepper, found: Found, options: Options
-) -> list[str]:
+    file: SimulationFile, recordings: Sequence[Recording], stepper: Stepper, found: Found, options: Options,
+    deadline: float,
+) -> list[str]:  # fmt: skip
     """A sentence where the simulation as it is follows the recordings far better once a column or the time is
     converted; none where no missing force is as strong as what is there, and where time has run out."""
     if not found.complete:
@@ -93,6 +94,8 @@ def in_other_units(
     missed = min(missed, _missed(file, recordings, options))
     tried: list[tuple[float, _Conversion]] = []
     for one in itertools.islice(_conversions(file, recordings), _MOST):
+        if time.monotonic() > deadline:
+            return []
         tried.append((_missed(file, one.recordings, options), one))
         if tried[-1][0] < _CLEARLY * min(1.0, missed):
             break
